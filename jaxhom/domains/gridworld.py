@@ -1,0 +1,177 @@
+"""The gridworld of Boularias and Chaib-draa (2010), section VI.A, after Abbeel and Ng (2004).
+
+A robot on a size x size grid takes one of four compass moves. With probability `noise` the action
+fails and a move drawn uniformly from the four (the chosen one among them) happens instead, so that
+the chosen move happens with probability 1 - noise + noise / 4. A move into the wall stays.
+
+The grid is cut into square, non-overlapping regions, with one indicator feature each: phi_i(s, a) =
+1 if s lies in region i. The reward sum_i w_i phi_i has weights that are 0 with probability 0.9 and
+uniform on (0, 1) otherwise (`sample_weights`).
+"""
+
+import dataclasses
+import functools
+import math
+import operator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom.mdp import MDP
+
+ACTIONS = ("up", "down", "left", "right")
+_MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
+_REWARDED_FRACTION = 0.1  # probability that a region's weight is not zero
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Gridworld:
+    """A gridworld and its geometry; state = row * size + column, row 0 on top. See `gridworld`.
+
+    Attributes:
+      mdp: the model, S = size * size states, A = 4 actions in the order of `ACTIONS`, K =
+        num_regions features.
+      coordinates: int32 [S, 2], (row, column) of every state.
+      region: int32 [S], the region of every state, numbered row by row; all 0 where there are no
+        regions.
+      size: number of rows, and of columns.
+    """
+
+    mdp: MDP
+    coordinates: jax.Array
+    region: jax.Array
+    size: int = dataclasses.field(metadata={"static": True})
+
+
+def gridworld(
+    size: int,
+    *,
+    num_regions: int | None = None,
+    noise: float = 0.3,
+    discount: float = 0.99,
+    start: tuple[int, int] = (0, 0),
+    dtype=None,
+) -> Gridworld:
+    """Builds the gridworld of section VI.A.
+
+    Args:
+      size: number of rows and of columns, at least 1.
+      num_regions: number of square regions K; its root must divide `size`. None: no features (K =
+        0).
+      noise: probability in [0, 1] that the action fails and a uniformly random move happens.
+      discount: scalar, strictly between 0 and 1.
+      start: (row, column) of the cell that the robot starts in.
+      dtype: floating-point type of the model; JAX's default if None (float64 needs
+        `jax_enable_x64`).
+
+    Returns:
+      The gridworld; its `mdp.features` [S, A, K] are the indicators of the regions.
+
+    Raises:
+      ValueError: if `size` or `noise` is out of range, `start` lies outside the grid, or
+        `num_regions` is not a square number whose root divides `size`.
+
+    Example:
+      >>> world = gridworld(16, num_regions=64)
+      >>> world.mdp.num_states, world.mdp.num_features
+      (256, 64)
+    """
+    size = _require_size(size)
+    if not 0.0 <= noise <= 1.0:
+        raise ValueError(f"noise must lie in [0, 1], got {noise}")
+    row, column = start
+    if not (0 <= row < size and 0 <= column < size):
+        raise ValueError(f"start must be a cell of the {size} x {size} grid, got {tuple(start)}")
+    coordinates = np.stack(np.divmod(np.arange(size * size), size), axis=-1)
+    region, features = np.zeros(size * size, np.int64), None
+    if num_regions is not None:
+        side = _region_side(size, num_regions)
+        region = (coordinates // side) @ np.array([size // side, 1])
+        features = region[:, None] == np.arange(num_regions)
+    next_state, probability = _transition(coordinates, size, noise)
+    initial = np.zeros(size * size)
+    initial[row * size + column] = 1.0
+    mdp = MDP.from_successors(
+        next_state,
+        np.asarray(probability, dtype),
+        discount=discount,
+        initial=initial,
+        features=features,
+    )
+    return Gridworld(
+        mdp=mdp,
+        coordinates=jnp.asarray(coordinates, jnp.int32),
+        region=jnp.asarray(region, jnp.int32),
+        size=size,
+    )
+
+
+@functools.partial(jax.jit, static_argnames="num_regions")
+def sample_weights(key: jax.Array, num_regions: int) -> jax.Array:
+    """Draws one weight per region: 0 with probability 0.9, otherwise uniform on (0, 1).
+
+    A draw of nothing but zeros would make every policy optimal, so it is repeated until a weight is
+    positive (with 16 regions 19% of draws are repeated). Works under `vmap` over keys, and under
+    `jit` with `num_regions` static.
+
+    Args:
+      key: a `jax.random` key; the same key gives the same weights.
+      num_regions: K, at least 1.
+
+    Returns:
+      float [K] in JAX's default type, the w of the reward sum_i w_i phi_i; not normalised.
+
+    Raises:
+      ValueError: if `num_regions` is below 1.
+    """
+    if num_regions < 1:
+        raise ValueError(f"num_regions must be at least 1, got {num_regions}")
+
+    def draw(key):
+        which, value = jax.random.split(key)
+        rewarded = jax.random.bernoulli(which, _REWARDED_FRACTION, (num_regions,))
+        return jnp.where(rewarded, jax.random.uniform(value, (num_regions,)), 0.0)
+
+    def redraw(state):
+        key, now = jax.random.split(state[0])
+        return key, draw(now)
+
+    def is_zero(state):
+        return ~jnp.any(state[1] > 0)
+
+    _, weights = jax.lax.while_loop(is_zero, redraw, redraw((key, None)))
+    return weights
+
+
+def _transition(coordinates, size: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Successors, probabilities [S, 4, 5]: slot 0 is the chosen move, 1-4 the random one."""
+    moved = np.clip(coordinates[:, None] + _MOVES, 0, size - 1)  # [S, 4, 2]
+    landing = moved @ np.array([size, 1])
+    at_random = np.broadcast_to(landing[:, None], (size * size, 4, 4))
+    next_state = np.concatenate([landing[..., None], at_random], axis=-1)
+    probability = np.array([1.0 - noise] + [noise / 4] * 4)
+    return next_state, np.broadcast_to(probability, next_state.shape)
+
+
+def _require_size(size) -> int:
+    """Returns `size` as an int of at least 1, or raises."""
+    try:
+        size = operator.index(size)
+    except TypeError:
+        raise ValueError(f"size must be a whole number, got {size!r}") from None
+    if size < 1:
+        raise ValueError(f"size must be at least 1, got {size}")
+    return size
+
+
+def _region_side(size: int, num_regions: int) -> int:
+    """Returns the side of a region in cells, or raises."""
+    root = math.isqrt(max(num_regions, 0))
+    if root == 0 or root * root != num_regions or size % root:
+        raise ValueError(
+            "num_regions must be a square number whose root divides the size: "
+            f"got {num_regions} for size {size}"
+        )
+    return size // root

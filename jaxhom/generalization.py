@@ -1,0 +1,209 @@
+"""Ways to extend the expert's policy from the demonstrated states to all states.
+
+Every function takes a model and demonstrations and returns a `Generalization`: on demonstrated states the empirical
+action frequencies, elsewhere what the method makes of them.
+
+Algorithm 1 of Boularias and Chaib-draa 2010 (`soft_local_homomorphism`) grows the set s^t of states within t steps
+of an unvisited state s. At the first t at which s^t holds a demonstrated state that is locally similar to s, all
+such states vote with their empirical policies. If s^t stops growing before, the policy at s is uniform.
+"""
+
+from collections.abc import Iterator
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.demonstrations import Demonstrations, empirical_policy
+from jaxhom.homomorphism import ClassSimilarity
+from jaxhom.local_models import local_model_classes, reachable_within
+from jaxhom.mdp import MDP
+
+
+@chex.dataclass(frozen=True)
+class Generalization:
+    """A policy for every state, and where each state's came from.
+
+    Attributes:
+      policy: [S, A], rows sum to 1.
+      visited: bool [S], the demonstrated states.
+      radius: int32 [S], how far the method had to look (steps); 0 on demonstrated states, -1 where nothing was
+        found and the policy is uniform.
+      support: int32 [S], how many demonstrated states voted; 1 on demonstrated states, 0 where nothing was found.
+    """
+
+    policy: jax.Array
+    visited: jax.Array
+    radius: jax.Array
+    support: jax.Array
+
+
+def soft_local_homomorphism(
+    mdp: MDP,
+    demonstrations: Demonstrations,
+    *,
+    distance: int = 1,
+    threshold: float = 0.0,
+    anchored: bool = True,
+    mutual: bool = False,
+    tolerance: float = 1e-4,
+    progress: bool = False,
+) -> Generalization:
+    """Algorithm 1: the votes of the nearest demonstrated states that are locally similar.
+
+    Args:
+      mdp: the model.
+      demonstrations: the expert's trajectories.
+      distance: d >= 1, the radius of the local models that are compared.
+      threshold: epsilon >= 0, the largest error at which two states count as similar.
+      anchored: require that the centre is mapped to the centre. False is the relation as printed, which on models
+        whose local models have absorbing states accepts nearly every pair.
+      mutual: require the error of both directions to be within the threshold.
+      tolerance: an error up to threshold + tolerance may count as similar; see `locally_similar`.
+      progress: show a progress bar.
+
+    Returns:
+      `Generalization`; `radius` is the t at which the algorithm stopped.
+
+    Raises:
+      ValueError: if a demonstration does not fit the model, or an option is out of range.
+
+    Source: Boularias and Chaib-draa 2010, Algorithm 1; anchoring and `mutual` are additions.
+    """
+    if not threshold >= 0:
+        raise ValueError(f"threshold must not be negative, got {threshold}")
+    if not tolerance > 0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    classes = local_model_classes(mdp, distance=distance)
+    similarity = ClassSimilarity(mdp, classes, distance, anchored, tolerance, threshold)
+    label = classes.label
+
+    def accept(state, expert):
+        return similarity.decide(label[state], label[expert], mutual=mutual, progress=progress)
+
+    return _vote_of_rings(mdp, demonstrations, accept)
+
+
+def nearest_neighbors(
+    mdp: MDP,
+    demonstrations: Demonstrations,
+    *,
+    metric: str = "hops",
+    coordinates=None,
+) -> Generalization:
+    """The votes of the nearest demonstrated states, by steps in the model or by Euclidean distance.
+
+    Args:
+      mdp: the model.
+      demonstrations: the expert's trajectories.
+      metric: "hops", the least number of steps by any actions from the state to the demonstrated one (the paper's
+        Manhattan distance), or "euclidean".
+      coordinates: [S, D], positions of the states; needed for "euclidean" alone.
+
+    Returns:
+      `Generalization`. All demonstrated states at the least distance vote. For "euclidean", `radius` is 1 plus the
+      number of nearer distances that occur between the state and others.
+
+    Raises:
+      ValueError: if a demonstration does not fit the model, or `metric` or `coordinates` do not.
+
+    Source: Boularias and Chaib-draa 2010, section VI (k-NN).
+    """
+    if metric == "hops":
+        return _vote_of_rings(mdp, demonstrations, lambda state, expert: np.ones(len(state), bool))
+    if metric != "euclidean":
+        raise ValueError(f'metric must be "hops" or "euclidean", got {metric!r}')
+    if coordinates is None:
+        raise ValueError('metric="euclidean" needs coordinates [S, D]')
+    coordinates = checks.as_host_array("coordinates", coordinates)
+    good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
+    checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
+    coordinates = checks.require_floats("coordinates", coordinates)
+    return _vote_of_nearest(mdp, demonstrations, coordinates)
+
+
+def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
+    """The uniform policy on every state that was not demonstrated.
+
+    Args:
+      mdp: the model.
+      demonstrations: the expert's trajectories.
+
+    Returns:
+      `Generalization`, with radius -1 off the demonstrated states.
+
+    Raises:
+      ValueError: if a demonstration does not fit the model.
+
+    Source: Boularias and Chaib-draa 2010, section VI.
+    """
+    visited, policy = empirical_policy(mdp, demonstrations)
+    return Generalization(
+        policy=policy,
+        visited=visited,
+        radius=jnp.where(visited, 0, -1).astype(jnp.int32),
+        support=visited.astype(jnp.int32),
+    )
+
+
+def _vote_of_rings(mdp: MDP, demonstrations: Demonstrations, accept) -> Generalization:
+    """Grows s^t for every unvisited s until a demonstrated state in it is accepted; the accepted ones vote.
+
+    `accept(states, experts)` decides pairs [P] and is asked once about every pair that a ring brings together.
+    """
+    start = maximum_entropy(mdp, demonstrations)
+    visited, policy = np.asarray(start.visited), np.array(start.policy)
+    radius, support = np.array(start.radius), np.array(start.support)
+    experts, waiting = np.flatnonzero(visited), np.flatnonzero(~visited)
+    for t, ring in enumerate(_rings(mdp, experts), start=1):
+        row, column = np.nonzero(ring[waiting])
+        accepted = accept(waiting[row], experts[column])
+        row, column = row[accepted], column[accepted]
+        votes = np.zeros((len(waiting), mdp.num_actions), policy.dtype)
+        np.add.at(votes, row, policy[experts[column]])
+        voters = np.bincount(row, minlength=len(waiting))
+        found = voters > 0
+        policy[waiting[found]] = votes[found] / votes[found].sum(axis=1, keepdims=True)
+        radius[waiting[found]], support[waiting[found]] = t, voters[found]
+        waiting = waiting[~found]
+        if not waiting.size:
+            break
+    return start.replace(
+        policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support)
+    )
+
+
+def _rings(mdp: MDP, experts: np.ndarray) -> Iterator[np.ndarray]:
+    """For t = 1, 2, ... until no set grows: bool [S, E], which demonstrated states joined s^t at step t."""
+    adjacency = reachable_within(mdp, 1)
+    within = np.zeros((mdp.num_states, len(experts)), bool)
+    within[experts, np.arange(len(experts))] = True
+    packed = np.packbits(within, axis=1)
+    while True:
+        # Row s of the union of its successors' rows; every row of `adjacency` holds s itself.
+        grown = np.bitwise_or.reduceat(packed[adjacency.indices], adjacency.indptr[:-1], axis=0)
+        joined = grown & ~packed
+        if not joined.any():
+            return
+        yield np.unpackbits(joined, axis=1, count=len(experts)).astype(bool)
+        packed = grown
+
+
+def _vote_of_nearest(mdp, demonstrations, coordinates) -> Generalization:
+    """Euclidean nearest demonstrated states, ties (to rounding) included."""
+    start = maximum_entropy(mdp, demonstrations)
+    visited, policy = np.asarray(start.visited), np.array(start.policy)
+    radius, support = np.array(start.radius), np.array(start.support)
+    experts = np.flatnonzero(visited)
+    for s in np.flatnonzero(~visited):
+        square = ((coordinates - coordinates[s]) ** 2).sum(axis=1)
+        nearest = square[experts].min()
+        voters = experts[square[experts] <= nearest * (1 + 1e-9)]
+        votes = policy[voters].sum(axis=0)
+        policy[s], support[s] = votes / votes.sum(), len(voters)
+        radius[s] = np.unique(square[square < nearest * (1 - 1e-9)].round(9)).size
+    return start.replace(
+        policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support)
+    )

@@ -1,0 +1,385 @@
+"""Soft local homomorphisms: how well one state's local model maps onto another's.
+
+LP (9) of Boularias and Chaib-draa 2010 gives every ordered pair of states an error e >= 0: the best a map f from
+M^{s,d} to M^{s',d} can do at commuting with the transitions (`pdhg.homomorphism_lp` states the program).
+e = 0 means that f is an exact homomorphism.
+
+As printed, the program can be empty of meaning: if the target has a distribution that is stationary under every
+action, an absorbing state say, mapping everything there gives e = 0 whatever the source. `anchored=True` requires
+in addition that the centre is mapped to the centre, which removes that solution; `anchored=False` is the program as
+printed.
+
+States whose local models are equal up to a renaming share every error, so one program per pair of classes is
+solved, never one per pair of states.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jaxhom import checks
+from jaxhom.local_models import (
+    LocalModelClasses,
+    local_model_classes,
+    local_models,
+    model_rounding,
+)
+from jaxhom.mdp import MDP
+from jaxhom.pdhg import Status, engine, solve_many
+from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
+
+_METHODS = ("auto", "pdhg")
+_SMALL = 8  # local models up to this size share one padding
+_MAX_LANES = 256
+_BATCH_BYTES = 32 * 2**20
+_CHUNK_BYTES = 256 * 2**20
+_MAX_ITERATIONS = 100_000
+
+
+@chex.dataclass(frozen=True)
+class LocalSimilarity:
+    """Certified brackets of the optimal errors of P pairs.
+
+    Attributes:
+      lower, upper: [P], lower <= e <= upper, rounding included.
+      iterations: int32 [P], PDHG iterations; 0 where the local models are isomorphic.
+      status: int32 [P], a `jaxhom.Status`.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    iterations: np.ndarray
+    status: np.ndarray
+
+
+def local_similarity(
+    mdp: MDP,
+    sources,
+    targets,
+    *,
+    distance: int = 1,
+    anchored: bool = True,
+    tolerance: float = 1e-4,
+    method: str = "auto",
+    max_iterations: int = _MAX_ITERATIONS,
+    progress: bool = False,
+) -> LocalSimilarity:
+    """Brackets the optimal error e of LP (9) for pairs of states, from M^{s,d} to M^{s',d}.
+
+    Args:
+      mdp: the model.
+      sources, targets: int [P], the states s and s' of each pair. The error is not symmetric.
+      distance: d >= 1, the radius of the local models.
+      anchored: require that the centre is mapped to the centre; False is the program as printed.
+      tolerance: largest upper - lower to settle for.
+      method: "pdhg", or "auto" for the fastest method known to the library.
+      max_iterations: per pair; a pair that needs more says so in `status` and keeps valid bounds.
+      progress: show a progress bar.
+
+    Returns:
+      `LocalSimilarity`, in the order of the pairs.
+
+    Raises:
+      ValueError: if a state is out of range, the shapes differ, or an option is unknown.
+
+    Source: Boularias and Chaib-draa 2010, eq. (9).
+    """
+    _check_options(method, tolerance)
+    sources, targets = _validated_pairs(mdp, sources, targets)
+    classes, source_label, target_label = _classes_of_pairs(mdp, sources, targets, distance)
+    solver = ClassSimilarity(mdp, classes, distance, anchored, tolerance, None, max_iterations)
+    unique, position = np.unique(np.stack([source_label, target_label], 1), axis=0, return_inverse=True)
+    bounds = solver.solve(unique, progress=progress)
+    return jax.tree.map(lambda leaf: leaf[position.ravel()], bounds)
+
+
+def locally_similar(
+    mdp: MDP,
+    sources,
+    targets,
+    threshold: float = 0.0,
+    *,
+    distance: int = 1,
+    anchored: bool = True,
+    mutual: bool = False,
+    tolerance: float = 1e-4,
+    progress: bool = False,
+) -> np.ndarray:
+    """Decides e <= threshold for pairs of states, stopping each pair as soon as its bounds settle it.
+
+    A pair counts as similar if e <= threshold is proved up to the tolerance (upper <= threshold + tolerance), and
+    as different if lower > threshold. Where both hold, the upper bound decides: within the band
+    (threshold, threshold + tolerance] either answer is possible. A pair that is not settled after the iteration
+    limit counts as different.
+
+    Args:
+      mdp: the model.
+      sources, targets: int [P], the states s and s' of each pair.
+      threshold: epsilon >= 0.
+      distance, anchored: as in `local_similarity`.
+      mutual: require the error of both directions to be within the threshold.
+      tolerance: width of the band.
+      progress: show a progress bar.
+
+    Returns:
+      bool [P].
+
+    Raises:
+      ValueError: as `local_similarity`.
+
+    Source: Boularias and Chaib-draa 2010, section V.
+    """
+    _check_options("auto", tolerance)
+    sources, targets = _validated_pairs(mdp, sources, targets)
+    classes, source_label, target_label = _classes_of_pairs(mdp, sources, targets, distance)
+    solver = ClassSimilarity(mdp, classes, distance, anchored, tolerance, threshold)
+    return solver.decide(source_label, target_label, mutual=mutual, progress=progress)
+
+
+class ClassSimilarity:
+    """Errors between classes of local models, each pair solved at most once.
+
+    Args:
+      mdp: the model.
+      classes: its states' classes.
+      distance, anchored, tolerance: as in `local_similarity`.
+      threshold: None to bracket errors, or epsilon to decide e <= epsilon.
+      max_iterations: per pair.
+    """
+
+    def __init__(
+        self,
+        mdp: MDP,
+        classes: LocalModelClasses,
+        distance: int,
+        anchored: bool,
+        tolerance: float,
+        threshold: float | None,
+        max_iterations: int = _MAX_ITERATIONS,
+    ):
+        self.classes, self.anchored = classes, anchored
+        self.tolerance, self.threshold = tolerance, threshold
+        self.max_iterations = max_iterations
+        self.rounding = model_rounding(mdp.dtype)
+        self.num_solved = 0
+        self._mdp, self._distance = mdp, distance
+        self._groups = _size_groups(classes.size)
+        self._models: dict[int, np.ndarray] = {}
+        num_classes = len(classes.representative)
+        # -1: not known; a decision for every ordered pair of classes that has been met.
+        self._decided = np.full((num_classes, num_classes), -1, np.int8)
+
+    def decide(self, sources, targets, *, mutual=False, progress=False) -> np.ndarray:
+        """bool [P]: is e(source class, target class) <= threshold? Only pairs not met before are solved."""
+        pairs = np.stack([sources, targets], axis=1).reshape(-1, 2)
+        met = np.concatenate([pairs, pairs[:, ::-1]]) if mutual else pairs
+        unknown = np.unique(met[self._decided[met[:, 0], met[:, 1]] < 0], axis=0)
+        if len(unknown):
+            bounds = self.solve(unknown, progress=progress)
+            similar = bounds.upper <= self.threshold + self.tolerance
+            self._decided[unknown[:, 0], unknown[:, 1]] = similar
+        answer = self._decided[pairs[:, 0], pairs[:, 1]] == 1
+        if mutual:
+            answer &= self._decided[pairs[:, 1], pairs[:, 0]] == 1
+        return answer
+
+    def solve(self, pairs: np.ndarray, *, progress: bool = False) -> LocalSimilarity:
+        """Bounds for different ordered pairs of classes [Q, 2]; a class against itself has an isomorphism."""
+        count, dtype = len(pairs), self._mdp.dtype
+        lower, upper = np.zeros(count, dtype), np.full(count, self.rounding, dtype)
+        iterations, status = np.zeros((2, count), np.int32)
+        groups = self._groups[pairs]
+        groups[pairs[:, 0] == pairs[:, 1]] = -1
+        self.num_solved += int((groups[:, 0] >= 0).sum())
+        with tqdm(total=count, desc="similarity", unit="pair", disable=not progress) as bar:
+            bar.update(int((groups[:, 0] < 0).sum()))
+            for group in np.unique(groups[groups[:, 0] >= 0], axis=0):
+                (members,) = np.nonzero((groups == group).all(axis=1))
+                chunk = self._chunk(*group)
+                for start in range(0, len(members), chunk):
+                    index = members[start : start + chunk]
+                    state = self._solve_group(pairs[index], *group, bar.update)
+                    width = self.rounding * (2.0 + max(self._models[g].shape[1] for g in group))
+                    lower[index] = np.maximum(state.lower - width, 0.0)
+                    upper[index] = state.upper + width
+                    iterations[index] = state.steps
+                    status[index] = self._status(state)
+        return LocalSimilarity(lower=lower, upper=upper, iterations=iterations, status=status)
+
+    def _solve_group(self, pairs, source_group, target_group, update) -> engine.PDHGState:
+        sources, targets = pairs.T
+        problem = HomomorphismProblem(
+            source=np.moveaxis(self._transitions(source_group)[self._row[sources]], 0, -1),
+            target=np.moveaxis(self._transitions(target_group)[self._row[targets]], 0, -1),
+            source_size=self.classes.size[sources],
+            target_size=self.classes.size[targets],
+            anchored=self.anchored,
+        )
+        return solve_many(
+            problem,
+            tolerance=self.tolerance,
+            threshold=self.threshold,
+            max_iterations=self.max_iterations,
+            lanes=self._lanes(source_group, target_group),
+            progress=update,
+        )
+
+    def _status(self, state: engine.PDHGState) -> np.ndarray:
+        settled = engine.is_settled(state, self.tolerance, self.threshold)
+        return np.where(settled, Status.SOLVED, Status.ITERATION_LIMIT)
+
+    @property
+    def _row(self) -> np.ndarray:
+        """Position of each class within its size group."""
+        row = np.zeros(len(self._groups), int)
+        for group in np.unique(self._groups):
+            (members,) = np.nonzero(self._groups == group)
+            row[members] = np.arange(len(members))
+        return row
+
+    def _transitions(self, group: int) -> np.ndarray:
+        """[C', n, A, n], the models of one size group's classes, padded to the largest of the group."""
+        if group not in self._models:
+            states = self.classes.representative[self._groups == group]
+            self._models[group] = local_models(self._mdp, states, self._distance).transition
+        return self._models[group]
+
+    def _lane_bytes(self, source_group: int, target_group: int) -> int:
+        """Memory of one lane: both models, and six pairs of points."""
+        n, m = (self._transitions(g).shape[1] for g in (source_group, target_group))
+        entries = self._mdp.num_actions * (n * n + m * m + 6 * n * m) + 6 * n * m
+        return entries * self._mdp.dtype.itemsize
+
+    def _lanes(self, source_group: int, target_group: int) -> int:
+        fitting = _BATCH_BYTES // self._lane_bytes(source_group, target_group)
+        return int(min(_MAX_LANES, 2 ** int(np.log2(max(fitting, 1)))))
+
+    def _chunk(self, source_group: int, target_group: int) -> int:
+        """Pairs whose answers are held at a time."""
+        return max(1, _CHUNK_BYTES // self._lane_bytes(source_group, target_group))
+
+
+@jax.custom_jvp
+def _anchored_error(source, target):
+    return _optimal_pair(source, target, True)[0]
+
+
+@jax.custom_jvp
+def _printed_error(source, target):
+    return _optimal_pair(source, target, False)[0]
+
+
+def homomorphism_error(source: jax.Array, target: jax.Array, *, anchored: bool = True) -> jax.Array:
+    """The optimal error e of LP (9) between two small models, as a differentiable function of both.
+
+    Args:
+      source: [n, A, n], transition tensor with the centre as state 0; rows sum to 1.
+      target: [m, A, m], likewise.
+      anchored: require that the centre is mapped to the centre; False is the program as printed.
+
+    Returns:
+      Scalar e, to 1e-6 in float64 (1e-4 in float32). Works under `jit`, `vmap`, `grad` and `jvp`.
+
+    Raises:
+      ValueError: if the shapes do not fit.
+
+    The derivative is the envelope theorem's, <y, (dT) f - f (dT')> at an optimal map f and an optimal dual y. Where
+    either is not unique, e is only directionally differentiable and what is returned is the slope for the pair that
+    the solver found; at e = 0 the dual y = 0 is optimal and the slope may be zero.
+
+    Source: Boularias and Chaib-draa 2010, eq. (9).
+    """
+    source, target = jnp.asarray(source), jnp.asarray(target)
+    for name, array in (("source", source), ("target", target)):
+        good = array.ndim == 3 and array.shape[0] == array.shape[2]
+        checks.require_shape(name, array, "[n, A, n]", good)
+    same = source.shape[1] == target.shape[1]
+    checks.require_shape("target", target, f"[m, {source.shape[1]}, m]", same)
+    dtype = jnp.promote_types(jnp.result_type(source, target), jnp.float32)
+    error = _anchored_error if anchored else _printed_error
+    return error(source.astype(dtype), target.astype(dtype))
+
+
+def _error_jvp(anchored, primals, tangents):
+    (source, target), (source_dot, target_dot) = primals, tangents
+    error, f, y = _optimal_pair(source, target, anchored)
+    change = jnp.einsum("iak,iaj,jk->", y, source_dot, f)
+    change -= jnp.einsum("iak,il,lak->", y, f, target_dot)
+    return error, change
+
+
+_anchored_error.defjvp(lambda primals, tangents: _error_jvp(True, primals, tangents))
+_printed_error.defjvp(lambda primals, tangents: _error_jvp(False, primals, tangents))
+
+
+def _optimal_pair(source, target, anchored) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """e, f [n, m] and y [n, A, m] of one instance; under vmap all instances share one batch."""
+
+    @jax.custom_batching.custom_vmap
+    def solve_batch(sources, targets):
+        return _solve_batch(sources, targets, anchored)
+
+    @solve_batch.def_vmap
+    def _merge_axes(axis_size, in_batched, sources, targets):
+        def with_axis(array, is_batched):
+            return array if is_batched else jnp.broadcast_to(array, (axis_size, *array.shape))
+
+        sources, targets = map(with_axis, (sources, targets), in_batched)
+        lanes = sources.shape[1]
+        flat = (array.reshape(-1, *array.shape[2:]) for array in (sources, targets))
+        merged = solve_batch(*flat)
+        split = jax.tree.map(lambda a: a.reshape(axis_size, lanes, *a.shape[1:]), merged)
+        return split, (True, True, True)
+
+    return jax.tree.map(lambda leaf: leaf[0], solve_batch(source[None], target[None]))
+
+
+def _solve_batch(sources, targets, anchored):
+    """[B, n, A, n], [B, m, A, m] -> e [B], f [B, n, m], y [B, n, A, m]."""
+    lanes, n = sources.shape[:2]
+    m = targets.shape[1]
+    problem = HomomorphismProblem(
+        source=jnp.moveaxis(jax.lax.stop_gradient(sources), 0, -1),
+        target=jnp.moveaxis(jax.lax.stop_gradient(targets), 0, -1),
+        source_size=jnp.full(lanes, n, jnp.int32),
+        target_size=jnp.full(lanes, m, jnp.int32),
+        anchored=anchored,
+    )
+    tolerance = 1e-6 if sources.dtype == jnp.float64 else 1e-4
+    state = engine.solve(
+        problem, engine.init(problem), tolerance=tolerance, max_iterations=_MAX_ITERATIONS
+    )
+    error = 0.5 * (state.lower + state.upper)
+    return error, jnp.moveaxis(state.best_primal, -1, 0), jnp.moveaxis(state.best_dual, -1, 0)
+
+
+def _size_groups(sizes: np.ndarray) -> np.ndarray:
+    """Group of each model: those up to `_SMALL` states together, then by powers of two."""
+    return np.ceil(np.log2(np.maximum(sizes, _SMALL))).astype(int)
+
+
+def _check_options(method: str, tolerance: float) -> None:
+    if method not in _METHODS:
+        raise ValueError(f"method must be one of {_METHODS}, got {method!r}")
+    if not tolerance > 0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+
+
+def _validated_pairs(mdp: MDP, sources, targets) -> tuple[np.ndarray, np.ndarray]:
+    arrays = []
+    for name, states in (("sources", sources), ("targets", targets)):
+        states = checks.as_host_array(name, states)
+        checks.require_shape(name, states, "[P]", states.ndim == 1)
+        arrays.append(checks.require_integers(name, states, upper=mdp.num_states))
+    checks.require_shape("targets", arrays[1], str(arrays[0].shape), len(arrays[0]) == len(arrays[1]))
+    return arrays[0], arrays[1]
+
+
+def _classes_of_pairs(mdp, sources, targets, distance):
+    """Classes of the states that occur, and the label of each source and target."""
+    states, position = np.unique(np.concatenate([sources, targets]), return_inverse=True)
+    classes = local_model_classes(mdp, states, distance)
+    labels = classes.label[position]
+    return classes, labels[: len(sources)], labels[len(sources) :]

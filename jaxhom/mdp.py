@@ -1,0 +1,359 @@
+"""Finite Markov decision processes without a reward, in two layouts.
+
+A model is T(s, a, s'), an initial distribution alpha, a discount gamma and features phi(s, a) of which the
+unknown reward is a non-negative combination (Boularias and Chaib-draa 2010, section II). What the solvers need
+of it are two linear maps, both defined here and nowhere else:
+
+    backward   (T v)(s, a) = sum_s' T(s, a, s') v(s')            `expected_next_value`
+    forward    (T^t x)(s') = sum_{s, a} x(s, a) T(s, a, s')      `push_forward`
+
+*Successor layout.* `next_state[S, A, N]` and `probability[S, A, N]` list the N successors of every pair, padded
+with probability 0. Rows wider than most (a restart anywhere on a track, say) would make every sweep pay for them,
+so slots beyond a narrow width are read for those few rows alone. The forward map reads the same numbers through
+their transpose, lists of (s, a, slot) entries per s', so that derivatives reach `probability` either way.
+
+*Dense layout.* Where N is near S the slots are the states themselves (`probability` is T) and both maps are
+matrix products. The choice is made once, in the constructors.
+
+Sweeps take a trailing batch axis: v is [S] or [S, B], x is [S, A] or [S, A, B]. Batch last is what XLA's CPU
+backend vectorises.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+
+_DENSE_FRACTION = 0.25  # dense layout from N >= S / 4 on, where products beat gathers
+_MAX_UNROLL = 16
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PaddedRows:
+    """Lists of entry indices per row, split so that a few long rows do not widen all of them.
+
+    Attributes:
+      narrow: int32 [R, W], the first W entries of every row; `sentinel` where a row is shorter.
+      wide_row: int32 [J], the rows that go on.
+      wide: int32 [J, V], their further entries; `sentinel` where a row is shorter.
+    """
+
+    narrow: jax.Array
+    wide_row: jax.Array
+    wide: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class MDP:
+    """A finite MDP without reward. Build it with `MDP.from_dense` or `MDP.from_successors`.
+
+    Attributes:
+      next_state: int32 [S, A, N], successors of each state-action pair (ascending; padding repeats 0).
+      probability: float [S, A, N], their probabilities; 0 on padding.
+      initial: float [S], distribution of the first state.
+      features: float [S, A, K]; the unknown reward is sum_i w_i features[..., i] with w_i >= 0.
+      discount: float scalar, strictly between 0 and 1.
+      wide_pairs: int32 [J], flat (s, a) indices of the pairs with successors beyond the narrow width.
+      predecessors: per state s', the flat (s, a, slot) entries that lead to it; None in the dense layout.
+      narrow_width: slots that every sweep reads for every pair.
+    """
+
+    next_state: jax.Array
+    probability: jax.Array
+    initial: jax.Array
+    features: jax.Array
+    discount: jax.Array
+    wide_pairs: jax.Array
+    predecessors: PaddedRows | None
+    narrow_width: int = dataclasses.field(metadata={"static": True})
+
+    @classmethod
+    def from_dense(cls, transition, *, discount, initial=None, features=None) -> "MDP":
+        """Builds a model from its transition tensor.
+
+        Args:
+          transition: [S, A, S], transition[s, a, s'] = T(s, a, s'); rows sum to 1.
+          discount: scalar, strictly between 0 and 1.
+          initial: [S] distribution of the first state; uniform if None.
+          features: [S, A, K], or [S, K] for features of the state alone; no features (K = 0) if None.
+
+        Returns:
+          The model, in the dtype of `transition` (integers become floats).
+
+        Raises:
+          ValueError: on a wrong shape, or naming the first entry that is NaN, negative or out of range, or the
+            first row that does not sum to 1.
+        """
+        transition = checks.as_host_array("transition", transition)
+        shape = transition.shape
+        good = len(shape) == 3 and shape[0] == shape[2] and min(shape, default=0) > 0
+        checks.require_shape("transition", transition, "[S, A, S] with S, A >= 1", good)
+        transition = checks.require_distribution("transition", transition)
+        num_states = shape[0]
+        width = int((transition > 0).sum(axis=-1).max())
+        if width >= _DENSE_FRACTION * num_states:
+            next_state = np.broadcast_to(np.arange(num_states, dtype=np.int32), shape)
+            return cls._assemble(next_state, transition, discount, initial, features)
+        next_state, probability = _compress(transition, width)
+        return cls._assemble(next_state, probability, discount, initial, features)
+
+    @classmethod
+    def from_successors(
+        cls, next_state, probability, *, discount, initial=None, features=None
+    ) -> "MDP":
+        """Builds a model from lists of successors, without ever making the dense tensor of a sparse model.
+
+        Args:
+          next_state: integers [S, A, N] in [0, S). A successor that is listed twice counts with the sum.
+          probability: [S, A, N]; rows sum to 1. Padding has probability 0 and any valid state.
+          discount: scalar, strictly between 0 and 1.
+          initial: [S] distribution of the first state; uniform if None.
+          features: [S, A, K] or [S, K]; no features (K = 0) if None.
+
+        Returns:
+          The model, in the dtype of `probability`.
+
+        Raises:
+          ValueError: as `from_dense`, and for a successor outside [0, S).
+        """
+        next_state = checks.as_host_array("next_state", next_state)
+        probability = checks.as_host_array("probability", probability)
+        good = next_state.ndim == 3 and min(next_state.shape) > 0
+        checks.require_shape("next_state", next_state, "[S, A, N] with S, A, N >= 1", good)
+        same = probability.shape == next_state.shape
+        checks.require_shape("probability", probability, str(next_state.shape), same)
+        next_state = checks.require_integers("next_state", next_state, upper=len(next_state))
+        probability = checks.require_distribution("probability", probability)
+        next_state, probability = _merge_repeated(next_state, probability)
+        num_states, _, width = next_state.shape
+        if width >= _DENSE_FRACTION * num_states:
+            return cls.from_dense(
+                _scatter_dense(next_state, probability),
+                discount=discount,
+                initial=initial,
+                features=features,
+            )
+        return cls._assemble(next_state, probability, discount, initial, features)
+
+    @classmethod
+    def _assemble(cls, next_state, probability, discount, initial, features) -> "MDP":
+        num_states, num_actions, width = next_state.shape
+        dtype = jnp.asarray(probability[:1, :1]).dtype  # float64 becomes float32 unless x64 is on
+        if initial is None:
+            initial = np.full(num_states, 1.0 / num_states)
+        initial = checks.as_host_array("initial", initial)
+        checks.require_shape("initial", initial, f"({num_states},)", initial.shape == (num_states,))
+        initial = checks.require_distribution("initial", initial)
+        features = _validated_features(features, num_states, num_actions)
+        dense = width == num_states
+        if num_states * num_actions * width >= 2**31 - 1:
+            raise ValueError(
+                f"the model has {num_states} x {num_actions} x {width} successor slots, more than 2^31 - 2"
+            )
+        narrow_width, wide_pairs, predecessors = width, np.zeros(0, np.int32), None
+        if not dense:
+            counts = (probability > 0).sum(axis=-1).ravel()
+            narrow_width = _narrow_width(counts)
+            wide_pairs = np.flatnonzero(counts > narrow_width).astype(np.int32)
+            predecessors = _transpose(next_state, probability)
+        return cls(
+            next_state=jnp.asarray(next_state, jnp.int32),
+            probability=jnp.asarray(probability, dtype),
+            initial=jnp.asarray(initial, dtype),
+            features=jnp.asarray(features, dtype),
+            discount=jnp.asarray(checks.require_discount(discount), dtype),
+            wide_pairs=jnp.asarray(wide_pairs),
+            predecessors=jax.tree.map(jnp.asarray, predecessors),
+            narrow_width=narrow_width,
+        )
+
+    def replace(self, **changes) -> "MDP":
+        """Returns the model with the given arrays exchanged (unchecked; usable under jit, vmap and grad).
+
+        A new `probability` must keep the zero pattern: successors are not searched for again.
+        """
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def num_states(self) -> int:
+        """S."""
+        return self.probability.shape[0]
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+        return self.probability.shape[1]
+
+    @property
+    def num_features(self) -> int:
+        """K."""
+        return self.features.shape[-1]
+
+    @property
+    def dtype(self):
+        """Floating-point type of the model, and so of the work done on it."""
+        return self.probability.dtype
+
+    @property
+    def is_dense(self) -> bool:
+        """True in the dense layout, where `probability` is the transition tensor itself."""
+        return self.predecessors is None
+
+    @property
+    def transition(self) -> jax.Array:
+        """The dense tensor T, [S, A, S]. Made anew at each call in the successor layout: mind its size."""
+        if self.is_dense:
+            return self.probability
+        states, actions, _ = self.probability.shape
+        s, a = jnp.ogrid[:states, :actions]
+        zeros = jnp.zeros((states, actions, states), self.dtype)
+        return zeros.at[s[..., None], a[..., None], self.next_state].add(self.probability)
+
+
+def expected_next_value(mdp: MDP, value: jax.Array) -> jax.Array:
+    """The backward map: E[value(s') | s, a], [S] -> [S, A] or [S, B] -> [S, A, B]."""
+    if mdp.is_dense:
+        return jnp.tensordot(mdp.probability, value, axes=1)
+    width, batch = mdp.narrow_width, value.shape[1:]
+    expected = _gather_sum(mdp.next_state[..., :width], mdp.probability[..., :width], value)
+    if not mdp.wide_pairs.size:
+        return expected
+    slots = mdp.next_state.shape[-1]
+    rest_state = mdp.next_state.reshape(-1, slots)[mdp.wide_pairs, width:]
+    rest_probability = mdp.probability.reshape(-1, slots)[mdp.wide_pairs, width:]
+    rest = _gather_sum(rest_state, rest_probability, value)
+    flat = expected.reshape((-1, *batch)).at[mdp.wide_pairs].add(rest)
+    return flat.reshape(expected.shape)
+
+
+def push_forward(mdp: MDP, occupancy: jax.Array) -> jax.Array:
+    """The forward map: sum_{s, a} x(s, a) T(s, a, s'), [S, A] -> [S] or [S, A, B] -> [S, B]."""
+    if mdp.is_dense:
+        return jnp.tensordot(mdp.probability, occupancy, axes=((0, 1), (0, 1)))
+    rows, slots = mdp.predecessors, mdp.probability.shape[-1]
+    flat = occupancy.reshape((-1, *occupancy.shape[2:]))
+    entries = jnp.append(mdp.probability.ravel(), jnp.zeros((), mdp.dtype))  # the sentinel's 0
+
+    def pull(entry):
+        pair = jnp.minimum(entry // slots, flat.shape[0] - 1)
+        return _gather_sum(pair, entries[entry], flat)
+
+    pushed = pull(rows.narrow)
+    if rows.wide_row.size:
+        pushed = pushed.at[rows.wide_row].add(pull(rows.wide))
+    return pushed
+
+
+def state_transition(mdp: MDP, policy: jax.Array) -> jax.Array:
+    """P_pi(s, s') = sum_a pi(s, a) T(s, a, s'), [S, A] -> [S, S] dense; for small models."""
+    if mdp.is_dense:
+        return jnp.einsum("sa,saz->sz", policy, mdp.probability)
+    weight = policy[..., None] * mdp.probability
+    rows = jnp.broadcast_to(jnp.arange(mdp.num_states)[:, None, None], weight.shape)
+    zeros = jnp.zeros((mdp.num_states, mdp.num_states), weight.dtype)
+    return zeros.at[rows, mdp.next_state].add(weight)
+
+
+def _gather_sum(index: jax.Array, weight: jax.Array, values: jax.Array) -> jax.Array:
+    """sum_n weight[..., n] values[index[..., n]], with `values` [R] or [R, B]; unrolled while n is small."""
+    spread = (..., None) if values.ndim == 2 else ...
+    if index.shape[-1] > _MAX_UNROLL:
+        letters = "rnb" if values.ndim == 2 else "rn"
+        flat_index = index.reshape(-1, index.shape[-1])
+        flat_weight = weight.reshape(flat_index.shape)
+        total = jnp.einsum(f"rn,{letters}->{letters.replace('n', '')}", flat_weight, values[flat_index])
+        return total.reshape(index.shape[:-1] + values.shape[1:])
+    return sum(weight[..., n][spread] * values[index[..., n]] for n in range(index.shape[-1]))
+
+
+def _compress(transition: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """[S, A, S] -> successors (ascending, padding last) and probabilities, [S, A, width]."""
+    s, a, z = np.nonzero(transition)
+    shape = transition.shape[:2]
+    pair = s * shape[1] + a
+    start = np.searchsorted(pair, np.arange(shape[0] * shape[1]))
+    slot = np.arange(len(pair)) - start[pair]
+    next_state = np.zeros((*shape, width), np.int32)
+    probability = np.zeros((*shape, width), transition.dtype)
+    next_state[s, a, slot] = z
+    probability[s, a, slot] = transition[s, a, z]
+    return next_state, probability
+
+
+def _merge_repeated(next_state, probability) -> tuple[np.ndarray, np.ndarray]:
+    """Sorts each row by successor, adds repeated ones up, and drops slots that no row uses."""
+    num_states = len(next_state)
+    next_state = np.where(probability > 0, next_state, num_states)  # padding sorts last
+    order = np.argsort(next_state, axis=-1, kind="stable")
+    next_state = np.take_along_axis(next_state, order, axis=-1)
+    probability = np.take_along_axis(probability, order, axis=-1)
+    is_first = np.ones(next_state.shape, bool)
+    is_first[..., 1:] = next_state[..., 1:] != next_state[..., :-1]
+    is_first &= next_state < num_states
+    group = np.cumsum(is_first, axis=-1) - 1
+    width = int(group.max()) + 1
+    s, a, slot = np.nonzero(next_state < num_states)
+    merged_state = np.zeros((*next_state.shape[:2], width), np.int32)
+    merged = np.zeros((*next_state.shape[:2], width), probability.dtype)
+    merged_state[s, a, group[s, a, slot]] = next_state[s, a, slot]
+    np.add.at(merged, (s, a, group[s, a, slot]), probability[s, a, slot])
+    return merged_state, merged
+
+
+def _scatter_dense(next_state, probability) -> np.ndarray:
+    """Successors without repetitions -> [S, A, S]."""
+    states, actions, _ = next_state.shape
+    transition = np.zeros((states, actions, states), probability.dtype)
+    s, a = np.ogrid[:states, :actions]
+    np.add.at(transition, (s[..., None], a[..., None], next_state), probability)
+    return transition
+
+
+def _validated_features(features, num_states: int, num_actions: int) -> np.ndarray:
+    """Returns features as [S, A, K], or raises."""
+    if features is None:
+        return np.zeros((num_states, num_actions, 0))
+    features = checks.as_host_array("features", features)
+    by_state = features.ndim == 2 and len(features) == num_states
+    by_pair = features.ndim == 3 and features.shape[:2] == (num_states, num_actions)
+    expected = f"({num_states}, {num_actions}, K) or ({num_states}, K)"
+    checks.require_shape("features", features, expected, by_state or by_pair)
+    features = checks.require_floats("features", features)
+    if by_pair:
+        return features
+    return np.broadcast_to(features[:, None], (num_states, num_actions, features.shape[-1]))
+
+
+def _narrow_width(counts: np.ndarray) -> int:
+    """Width that minimises the slots read per sweep, all rows to the width and long rows to the end."""
+    longest = int(counts.max())
+    widths = np.unique(counts[counts > 0])
+    beyond = np.array([(counts > w).sum() for w in widths])
+    cost = counts.size * widths + beyond * (longest - widths)
+    best = int(np.argmin(cost))
+    return int(widths[best]) if 2 * cost[best] < cost[-1] else longest
+
+
+def _transpose(next_state: np.ndarray, probability: np.ndarray) -> PaddedRows:
+    """Lists, per s', the flat (s, a, slot) entries with positive probability that lead to it."""
+    num_states, sentinel = len(next_state), next_state.size
+    entry = np.flatnonzero(probability > 0)
+    target = next_state.ravel()[entry]
+    order = np.argsort(target, kind="stable")
+    entry, target = entry[order], target[order]
+    counts = np.bincount(target, minlength=num_states)
+    slot = np.arange(len(entry)) - (np.cumsum(counts) - counts)[target]
+    width, longest = _narrow_width(counts), int(counts.max())
+    wide_row = np.flatnonzero(counts > width)
+    narrow = np.full((num_states, width), sentinel, np.int32)
+    wide = np.full((len(wide_row), longest - width), sentinel, np.int32)
+    inside = slot < width
+    narrow[target[inside], slot[inside]] = entry[inside]
+    position = np.searchsorted(wide_row, target[~inside])
+    wide[position, slot[~inside] - width] = entry[~inside]
+    return PaddedRows(narrow=narrow, wide_row=wide_row.astype(np.int32), wide=wide)

@@ -1,0 +1,253 @@
+"""Occupancy measures, feature expectations and policy values by jitted linear solves.
+
+With P_pi(s, s') = sum_a pi(s, a) T(s, a, s'), the state occupancy mu and the value V of a reward r are the
+solutions of a linear system and of its transpose:
+
+    (I - gamma P_pi)^T mu = alpha,   x(s, a) = mu(s) pi(s, a)        (the flow, Boularias and Chaib-draa eq. 3)
+    (I - gamma P_pi)   V  = r_pi,    r_pi(s) = sum_a pi(s, a) r(s, a)
+
+Small models are solved by dense LU. Larger ones by BiCGSTAB on the two sweeps of `mdp`, followed, where Krylov
+stops short, by plain sweeps x <- b + gamma P x, which always contract. The residual is checked at the end: a
+solution that misses the tolerance (a policy that holds NaN, say) comes back as NaN, never as a wrong number.
+Derivatives are implicit (one more solve with the transpose), whatever the method.
+
+Policies are [S, A] or a batch [B, S, A]; inside, the batch is the last axis.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxhom import checks
+from jaxhom.mdp import MDP, expected_next_value, push_forward, state_transition
+
+_MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
+_MAX_LU_STATES_DENSE = 256  # ... and products with the dense tensor
+_MAX_KRYLOV_STEPS = 1000
+
+
+def occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
+    """Discounted state-action occupancy x(s, a) = E sum_t gamma^t 1[s_t = s, a_t = a].
+
+    Args:
+      mdp: the model.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+
+    Returns:
+      [S, A] or [B, S, A]; each sums to 1 / (1 - discount).
+
+    Raises:
+      ValueError: if `policy` has another shape.
+
+    Source: Boularias and Chaib-draa 2010, section II and eqs. (3)-(4).
+    """
+    policy = jnp.asarray(policy, mdp.dtype)
+    check_policy_shape(mdp, policy)
+    if policy.ndim == 3:
+        return jnp.moveaxis(_occupancy(mdp, jnp.moveaxis(policy, 0, -1)), -1, 0)
+    return _occupancy(mdp, policy)
+
+
+def feature_expectations(mdp: MDP, policy: jax.Array) -> jax.Array:
+    """Discounted feature expectations V_i(pi) = sum_{s, a} x_pi(s, a) phi_i(s, a).
+
+    Args:
+      mdp: the model, with K features.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+
+    Returns:
+      [K] or [B, K]; divide by 1 / (1 - discount) for a weighted average per step.
+
+    Raises:
+      ValueError: if `policy` has another shape.
+
+    Source: Boularias and Chaib-draa 2010, section II.
+    """
+    return jnp.einsum("...sa,sak->...k", occupancy(mdp, policy), mdp.features)
+
+
+def policy_value(mdp: MDP, policy: jax.Array, reward: jax.Array) -> jax.Array:
+    """State values V(s) = E[sum_t gamma^t r(s_t, a_t) | s_0 = s] of a policy.
+
+    Args:
+      mdp: the model.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+      reward: [S, A], or [B, S, A] beside a batch of policies.
+
+    Returns:
+      [S] or [B, S].
+
+    Raises:
+      ValueError: if the shapes do not fit.
+
+    Source: Boularias and Chaib-draa 2010, section II.
+    """
+    policy, reward = jnp.asarray(policy, mdp.dtype), jnp.asarray(reward, mdp.dtype)
+    check_policy_shape(mdp, policy)
+    fits = reward.shape in (policy.shape, policy.shape[-2:])
+    checks.require_shape("reward", reward, f"{policy.shape[-2:]} or the policy's", fits)
+    reward_under_policy = (policy * reward).sum(axis=-1)
+    if policy.ndim == 3:
+        batch_last = jnp.moveaxis(policy, 0, -1)
+        return _solve_values(mdp, batch_last, reward_under_policy.T).T
+    return _solve_values(mdp, policy, reward_under_policy)
+
+
+def check_policy_shape(mdp: MDP, policy: jax.Array, name: str = "policy") -> None:
+    """Raises `ValueError` unless `policy` is [S, A] or [B, S, A] for this model."""
+    shape = (mdp.num_states, mdp.num_actions)
+    good = jnp.ndim(policy) in (2, 3) and policy.shape[-2:] == shape
+    checks.require_shape(name, policy, f"{shape} or (B, {shape[0]}, {shape[1]})", good)
+
+
+@jax.jit
+def _occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
+    """`occupancy` with the batch, if any, last: [S, A] or [S, A, B]."""
+    initial = jnp.broadcast_to(
+        mdp.initial[(...,) + (None,) * (policy.ndim - 2)], policy.shape[:1] + policy.shape[2:]
+    )
+    state_occupancy = _solve_flow(mdp, policy, initial)
+    # Rounding can leave -1e-17 where nothing goes; lifted without touching the derivative.
+    lifted = jnp.maximum(state_occupancy, 0.0)
+    state_occupancy += jax.lax.stop_gradient(lifted - state_occupancy)
+    return state_occupancy[:, None] * policy
+
+
+def _solve_flow(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
+    """Solves (I - gamma P_pi)^T mu = source; [S] or, batch last, [S, B]."""
+    if _is_small(mdp):
+        return _solve_by_lu(mdp, policy, source, transpose=True)
+    forward, backward = _sweeps(mdp, policy)
+    return _solve_by_sweeps(mdp.discount, forward, backward, source)
+
+
+@jax.jit
+def _solve_values(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
+    """Solves (I - gamma P_pi) V = source; [S] or, batch last, [S, B]."""
+    if _is_small(mdp):
+        return _solve_by_lu(mdp, policy, source, transpose=False)
+    forward, backward = _sweeps(mdp, policy)
+    return _solve_by_sweeps(mdp.discount, backward, forward, source)
+
+
+def _is_small(mdp: MDP) -> bool:
+    return mdp.num_states <= (_MAX_LU_STATES_DENSE if mdp.is_dense else _MAX_LU_STATES)
+
+
+def _sweeps(mdp: MDP, policy: jax.Array) -> tuple[Callable, Callable]:
+    """The products with P_pi^T and P_pi."""
+
+    def forward(mu):
+        return push_forward(mdp, mu[:, None] * policy)
+
+    def backward(value):
+        return (policy * expected_next_value(mdp, value)).sum(axis=1)
+
+    return forward, backward
+
+
+def _solve_by_lu(mdp: MDP, policy: jax.Array, source: jax.Array, transpose: bool) -> jax.Array:
+    def solve(policy, source):
+        system = jnp.eye(mdp.num_states, dtype=mdp.dtype)
+        system -= mdp.discount * state_transition(mdp, policy)
+        return jnp.linalg.solve(system.T if transpose else system, source)
+
+    if policy.ndim == 3:
+        return jax.vmap(solve, in_axes=-1, out_axes=-1)(policy, source)
+    return solve(policy, source)
+
+
+def _solve_by_sweeps(discount, product: Callable, transposed: Callable, source) -> jax.Array:
+    """Solves x = source + discount * product(x), differentiable through `custom_linear_solve`."""
+
+    def solver(operator):
+        def solve(_, b):
+            x = _bicgstab(lambda v: v - discount * operator(v), b)
+            return _sweep_until(lambda v: b + discount * operator(v), x, b, discount)
+
+        return solve
+
+    return jax.lax.custom_linear_solve(
+        lambda x: x - discount * product(x),
+        source,
+        solve=solver(product),
+        transpose_solve=solver(transposed),
+    )
+
+
+def _residual_tolerance(x: jax.Array, b: jax.Array) -> jax.Array:
+    """Residual to reach per lane, in the 2-norm: a small multiple of what rounding in x and b leaves."""
+    scale = jnp.linalg.norm(x, axis=0) + jnp.linalg.norm(b, axis=0)
+    return 16.0 * jnp.finfo(b.dtype).eps * scale
+
+
+def _bicgstab(system: Callable, b: jax.Array) -> jax.Array:
+    """Batched BiCGSTAB (van der Vorst 1992); lanes are the trailing axis and stop one by one.
+
+    A lane that breaks down stops where it is; the caller's sweeps take over from there.
+    """
+
+    def dot(u, v):
+        return (u * v).sum(axis=0)
+
+    def safe(numerator, denominator):
+        ok = denominator != 0
+        return jnp.where(ok, numerator / jnp.where(ok, denominator, 1.0), 0.0)
+
+    def is_active(state):
+        x, residual, _, rho, _ = state
+        tolerance = 0.5 * _residual_tolerance(x, b)
+        return (jnp.linalg.norm(residual, axis=0) > tolerance) & (rho != 0)
+
+    def keep_going(state):
+        return jnp.any(is_active(state)) & (state[-1] < _MAX_KRYLOV_STEPS)
+
+    def step(state):
+        x, residual, direction, rho, count = state
+        active = is_active(state)
+        product = system(direction)
+        alpha = safe(rho, dot(shadow, product))
+        half = residual - alpha * product
+        half_product = system(half)
+        omega = safe(dot(half_product, half), dot(half_product, half_product))
+        new_x = x + alpha * direction + omega * half
+        new_residual = half - omega * half_product
+        new_rho = dot(shadow, new_residual)
+        beta = safe(new_rho, rho) * safe(alpha, omega)
+        new_direction = new_residual + beta * (direction - omega * product)
+        finite = jnp.isfinite(dot(new_x, new_x) + dot(new_direction, new_direction))
+        take = active & finite
+        new_rho = jnp.where(finite, new_rho, 0.0)  # a lane that overflowed is out
+        choose = lambda new, old: jnp.where(take, new, old)  # noqa: E731
+        return (
+            choose(new_x, x),
+            choose(new_residual, residual),
+            choose(new_direction, direction),
+            jnp.where(active, new_rho, rho),
+            count + 1,
+        )
+
+    shadow = b
+    start = (jnp.zeros_like(b), b, b, dot(b, b), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(keep_going, step, start)[0]
+
+
+def _sweep_until(sweep: Callable, x: jax.Array, b: jax.Array, discount) -> jax.Array:
+    """Applies the contraction `sweep` until its change is rounding on every lane; NaN where it never is."""
+    limit = jnp.log(jnp.finfo(x.dtype).eps) / jnp.log(discount) + 10
+
+    def is_rough(x, swept, factor=1.0):
+        return ~(jnp.linalg.norm(swept - x, axis=0) <= factor * _residual_tolerance(x, b))
+
+    def keep_going(state):
+        x, swept, count = state
+        return jnp.any(is_rough(x, swept)) & (count < limit)
+
+    def step(state):
+        _, swept, count = state
+        return swept, sweep(swept), count + 1
+
+    start = (x, sweep(x), jnp.zeros((), jnp.int32))
+    x, swept, _ = jax.lax.while_loop(keep_going, step, start)
+    return jnp.where(is_rough(x, swept, factor=10.0), jnp.nan, swept)

@@ -1,0 +1,107 @@
+"""Many problems through a fixed number of lanes: finished lanes leave, waiting problems take their place.
+
+Under one `while_loop` a batch runs until its slowest lane stops. Here the loop ends when a quarter of the lanes are
+done; the host takes their answers out, fills them from the queue, and narrows the batch when the queue is empty.
+Shapes come from a short list of widths, so nothing is compiled twice.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom.pdhg import engine
+
+_STOP_FRACTION = 0.25
+_NARROWER = 8  # ratio between the widths of the batch
+
+
+def solve_many(
+    problem: engine.Problem,
+    *,
+    tolerance: float,
+    threshold: np.ndarray | None = None,
+    max_iterations: int = 100_000,
+    lanes: int = 256,
+    progress: Callable[[int], object] = lambda count: None,
+) -> engine.PDHGState:
+    """Solves every lane of `problem`, a few hundred at a time.
+
+    Args:
+      problem: arrays on the host or the device, P problems on the last axis of every leaf.
+      tolerance: gap to reach.
+      threshold: None, or [P]: see `engine.is_settled`.
+      max_iterations: per problem.
+      lanes: width of the batch on the device.
+      progress: called with the number of problems that just finished.
+
+    Returns:
+      The final state of every problem, [P] last, in NumPy arrays: bounds, best points and steps.
+    """
+    problem = jax.tree.map(np.asarray, problem)
+    total = jax.tree.leaves(problem)[0].shape[-1]
+    limits = None if threshold is None else np.broadcast_to(threshold, (total,))
+    results = None
+    state, busy, owner = None, np.zeros(0, int), np.zeros(0, int)
+    waiting = 0
+    while waiting < total or busy.size:
+        fresh = np.arange(waiting, min(total, waiting + lanes - busy.size))
+        waiting += fresh.size
+        width = _width(busy.size + fresh.size, lanes)
+        source = np.full(width, -1)
+        source[: busy.size] = busy
+        owner = np.resize(np.append(owner[busy], fresh), width)  # surplus lanes repeat the first
+        used = busy.size + fresh.size
+        batch = jax.tree.map(lambda leaf, owner=owner: leaf[..., owner], problem)
+        limit = None if limits is None else limits[owner]
+        state = _resume(batch, state, source)
+        state, done = _run(batch, state, limit, used, tolerance, max_iterations)
+        done = np.asarray(done)[:used]
+        busy, finished = np.flatnonzero(~done), np.flatnonzero(done)
+        results = _store(results, state, finished, owner[finished], total)
+        progress(finished.size)
+    return results
+
+
+def _width(count: int, lanes: int) -> int:
+    """The narrowest of the widths lanes, lanes / 8, lanes / 64, ... that holds `count`."""
+    width = lanes
+    while width > _NARROWER and width // _NARROWER >= count:
+        width //= _NARROWER
+    return width
+
+
+@jax.jit
+def _resume(problem, state, source) -> engine.PDHGState:
+    """Lanes of a former state where `source` names one, fresh ones where it is -1."""
+    fresh = engine.init(problem)
+    if state is None:
+        return fresh
+    return jax.tree.map(lambda old, new: jnp.where(source >= 0, old[..., source], new), state, fresh)
+
+
+@jax.jit
+def _run(problem, state, threshold, used, tolerance, max_iterations):
+    """Steps until a quarter of the `used` lanes are done; returns which."""
+
+    def is_done(state):
+        settled = engine.is_settled(state, tolerance, threshold)
+        return settled | (state.steps >= max_iterations)
+
+    def keep_going(state):
+        done = is_done(state) & (jnp.arange(state.steps.size) < used)
+        return done.sum() < _STOP_FRACTION * used
+
+    state = jax.lax.while_loop(keep_going, lambda s: engine.step(problem, s), state)
+    return state, is_done(state)
+
+
+def _store(results, state, finished, target, total):
+    """Writes the finished lanes of `state` to their places in `results`."""
+    host = jax.tree.map(lambda leaf: np.asarray(leaf)[..., finished], state)
+    if results is None:
+        results = jax.tree.map(lambda leaf: np.zeros((*leaf.shape[:-1], total), leaf.dtype), host)
+    for whole, part in zip(jax.tree.leaves(results), jax.tree.leaves(host), strict=True):
+        whole[..., target] = part
+    return results

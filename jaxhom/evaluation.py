@@ -149,16 +149,19 @@ def evaluate_by_sampling(
     Source: Boularias and Chaib-draa 2010, section VI; they report no errors.
     """
     policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
-    evaluate = functools.partial(
-        _evaluate_trials,
-        horizon=_require_count("horizon", horizon, 1),
-        num_trials=_require_count("num_trials", num_trials, 2),
-        count_terminal_step=bool(count_terminal_step),
-    )
+    horizon = _require_count("horizon", horizon, 1)
+    num_trials = _require_count("num_trials", num_trials, 2)
+
+    def evaluate(policy, reward):
+        # One state more than steps: the last step of a trial may be the one that finishes it.
+        trials = sample_demonstrations(key, mdp, policy, num_trials, horizon + 1)
+        return _evaluate_trials(
+            trials, reward, terminal, events, count_terminal_step=bool(count_terminal_step)
+        )
+
     if policy.ndim == 3:
-        lanes = (None, None, 0, 0 if reward.ndim == 3 else None, None, None)
-        evaluate = jax.vmap(evaluate, in_axes=lanes)
-    return evaluate(key, mdp, policy, reward, terminal, events)
+        evaluate = jax.vmap(evaluate, in_axes=(0, 0 if reward.ndim == 3 else None))
+    return evaluate(policy, reward)
 
 
 def agreement(
@@ -233,46 +236,41 @@ def _evaluate_visits(mdp, policy, reward, terminal, events, *, horizon, count_te
     )
 
 
-@functools.partial(jax.jit, static_argnames=("horizon", "num_trials", "count_terminal_step"))
-def _evaluate_trials(
-    key, mdp, policy, reward, terminal, events, *, horizon, num_trials, count_terminal_step
-):
-    """`evaluate_by_sampling` for one policy."""
-    # One state more than steps: the last step of a trial may be the one that finishes it.
-    trials = sample_demonstrations(key, mdp, policy, num_trials, horizon + 1)
-    has_ended = jax.lax.cummax(terminal[trials.states].astype(jnp.int32), axis=1)  # [M, H + 1]
-    stopped = jnp.pad(has_ended, ((0, 0), (1, 0))) if count_terminal_step else has_ended
-    taken = (stopped[:, :horizon] == 0).astype(mdp.dtype)  # [M, H], the steps that count
+@functools.partial(jax.jit, static_argnames="count_terminal_step")
+def _evaluate_trials(trials, reward, terminal, events, *, count_terminal_step):
+    """Means and standard errors of trials [M, H + 1] of one policy."""
+    horizon, dtype = trials.horizon - 1, reward.dtype
+    is_terminal = terminal[trials.states]
+    finished = is_terminal.any(axis=1)
+    arrival = jnp.where(finished, is_terminal.argmax(axis=1), horizon)  # steps that lead there
+    taken = jnp.arange(horizon) < (arrival + count_terminal_step)[:, None]  # [M, H]
     pairs = trials.states[:, :horizon], trials.actions[:, :horizon]
 
     def totals(per_pair):
-        return (per_pair[pairs] * taken).sum(axis=1)
+        return jnp.where(taken, per_pair[pairs], 0.0).sum(axis=1)
 
-    steps, rewards = taken.sum(axis=1), totals(reward)
-    estimates = {
-        "reward_per_step": _ratio(rewards, steps),
-        "total_reward": _mean(rewards),
-        "steps": _mean(steps),
-        "finished": _mean(has_ended[:, -1].astype(mdp.dtype)),
-        "events": {name: _ratio(totals(event), steps) for name, event in events.items()},
-    }
-    mean, error = (
-        jax.tree.map(lambda pair: pair[i], estimates, is_leaf=lambda node: isinstance(node, tuple))
-        for i in range(2)
+    steps, rewards = taken.sum(axis=1, dtype=dtype), totals(reward)
+    both = Evaluation(  # every measure beside its standard error, [2]
+        reward_per_step=_ratio(rewards, steps),
+        total_reward=_mean(rewards),
+        steps=_mean(steps),
+        finished=_mean(finished.astype(dtype)),
+        events={name: _ratio(totals(event), steps) for name, event in events.items()},
     )
-    return Evaluation(**mean, standard_error=Evaluation(**error))
+    mean, error = (jax.tree.map(operator.itemgetter(i), both) for i in range(2))
+    return mean.replace(standard_error=error)
 
 
-def _mean(samples: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean over trials, [M] -> scalar, and its standard error."""
-    return samples.mean(), samples.std(ddof=1) / jnp.sqrt(len(samples))
+def _mean(samples: jax.Array) -> jax.Array:
+    """Mean over trials and its standard error, [M] -> [2]."""
+    return jnp.stack([samples.mean(), samples.std(ddof=1) / jnp.sqrt(len(samples))])
 
 
-def _ratio(numerator: jax.Array, denominator: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ratio of the means of two [M] samples, and its standard error by the delta method."""
+def _ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+    """Ratio of the means of two [M] samples and its standard error by the delta method, [2]."""
     ratio = numerator.mean() / denominator.mean()
     _, error = _mean(numerator - ratio * denominator)
-    return ratio, error / denominator.mean()
+    return jnp.stack([ratio, error / denominator.mean()])
 
 
 def _batch_last(array: jax.Array) -> jax.Array:

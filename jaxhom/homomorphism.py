@@ -32,7 +32,7 @@ from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
 _METHODS = ("auto", "pdhg")
 _SMALL = 8  # local models up to this size share one padding
-_MAX_LANES = 256
+_MAX_LANES = 64
 _BATCH_BYTES = 32 * 2**20
 _CHUNK_BYTES = 256 * 2**20
 _MAX_ITERATIONS = 100_000
@@ -190,39 +190,42 @@ class ClassSimilarity:
         count, dtype = len(pairs), self._mdp.dtype
         lower, upper = np.zeros(count, dtype), np.full(count, self.rounding, dtype)
         iterations, status = np.zeros((2, count), np.int32)
-        groups = self._groups[pairs]
-        groups[pairs[:, 0] == pairs[:, 1]] = -1
-        self.num_solved += int((groups[:, 0] >= 0).sum())
+        # Both sides of a pair are padded alike, so that few shapes are compiled.
+        groups = np.where(pairs[:, 0] == pairs[:, 1], -1, self._groups[pairs].max(axis=1))
+        self.num_solved += int((groups >= 0).sum())
         with tqdm(total=count, desc="similarity", unit="pair", disable=not progress) as bar:
-            bar.update(int((groups[:, 0] < 0).sum()))
-            for group in np.unique(groups[groups[:, 0] >= 0], axis=0):
-                (members,) = np.nonzero((groups == group).all(axis=1))
-                chunk = self._chunk(*group)
+            bar.update(int((groups < 0).sum()))
+            for group in np.unique(groups[groups >= 0]):
+                (members,) = np.nonzero(groups == group)
+                chunk = max(1, _CHUNK_BYTES // self._lane_bytes(group))
                 for start in range(0, len(members), chunk):
                     index = members[start : start + chunk]
-                    state = self._solve_group(pairs[index], *group, bar.update)
-                    width = self.rounding * (2.0 + max(self._models[g].shape[1] for g in group))
+                    state = self._solve_group(pairs[index], group, bar.update)
+                    width = self.rounding * (2.0 + self._transitions(group).shape[1])
                     lower[index] = np.maximum(state.lower - width, 0.0)
                     upper[index] = state.upper + width
                     iterations[index] = state.steps
                     status[index] = self._status(state)
         return LocalSimilarity(lower=lower, upper=upper, iterations=iterations, status=status)
 
-    def _solve_group(self, pairs, source_group, target_group, update) -> engine.PDHGState:
-        sources, targets = pairs.T
+    def _solve_group(self, pairs: np.ndarray, group: int, update) -> engine.PDHGState:
+        """Runs the programs of pairs [Q, 2] whose larger model is of the given size group."""
+        transitions, rows = self._transitions(group), self._rows(group)
+        source, target = (np.moveaxis(transitions[rows[side]], 0, -1) for side in pairs.T)
         problem = HomomorphismProblem(
-            source=np.moveaxis(self._transitions(source_group)[self._row[sources]], 0, -1),
-            target=np.moveaxis(self._transitions(target_group)[self._row[targets]], 0, -1),
-            source_size=self.classes.size[sources],
-            target_size=self.classes.size[targets],
+            source=source,
+            target=target,
+            source_size=self.classes.size[pairs[:, 0]],
+            target_size=self.classes.size[pairs[:, 1]],
             anchored=self.anchored,
         )
+        fitting = max(1, _BATCH_BYTES // self._lane_bytes(group))
         return solve_many(
             problem,
             tolerance=self.tolerance,
             threshold=self.threshold,
             max_iterations=self.max_iterations,
-            lanes=self._lanes(source_group, target_group),
+            lanes=int(min(_MAX_LANES, 2 ** int(np.log2(fitting)))),
             progress=update,
         )
 
@@ -230,35 +233,21 @@ class ClassSimilarity:
         settled = engine.is_settled(state, self.tolerance, self.threshold)
         return np.where(settled, Status.SOLVED, Status.ITERATION_LIMIT)
 
-    @property
-    def _row(self) -> np.ndarray:
-        """Position of each class within its size group."""
-        row = np.zeros(len(self._groups), int)
-        for group in np.unique(self._groups):
-            (members,) = np.nonzero(self._groups == group)
-            row[members] = np.arange(len(members))
-        return row
+    def _rows(self, group: int) -> np.ndarray:
+        """Position of each class among those of the group and below; meaningless for larger ones."""
+        return np.cumsum(self._groups <= group) - 1
 
     def _transitions(self, group: int) -> np.ndarray:
-        """[C', n, A, n], the models of one size group's classes, padded to the largest of the group."""
+        """[C', n, A, n], the models of the classes up to a size group, padded to the largest of them."""
         if group not in self._models:
-            states = self.classes.representative[self._groups == group]
+            states = self.classes.representative[self._groups <= group]
             self._models[group] = local_models(self._mdp, states, self._distance).transition
         return self._models[group]
 
-    def _lane_bytes(self, source_group: int, target_group: int) -> int:
+    def _lane_bytes(self, group: int) -> int:
         """Memory of one lane: both models, and six pairs of points."""
-        n, m = (self._transitions(g).shape[1] for g in (source_group, target_group))
-        entries = self._mdp.num_actions * (n * n + m * m + 6 * n * m) + 6 * n * m
-        return entries * self._mdp.dtype.itemsize
-
-    def _lanes(self, source_group: int, target_group: int) -> int:
-        fitting = _BATCH_BYTES // self._lane_bytes(source_group, target_group)
-        return int(min(_MAX_LANES, 2 ** int(np.log2(max(fitting, 1)))))
-
-    def _chunk(self, source_group: int, target_group: int) -> int:
-        """Pairs whose answers are held at a time."""
-        return max(1, _CHUNK_BYTES // self._lane_bytes(source_group, target_group))
+        _, n, num_actions, _ = self._transitions(group).shape
+        return (num_actions * (2 * n * n + 6 * n * n) + 6 * n * n) * self._mdp.dtype.itemsize
 
 
 @jax.custom_jvp

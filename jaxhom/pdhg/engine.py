@@ -26,6 +26,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxhom.pdhg.projections import reduce_leading
+
 _SUFFICIENT_DECAY = 0.2  # restart at once
 _NECESSARY_DECAY = 0.8  # restart when the residual has begun to rise
 _ARTIFICIAL_FRACTION = 0.36  # restart when the round is this fraction of all steps
@@ -138,26 +140,25 @@ def init(problem: Problem, start: tuple[jax.Array, jax.Array] | None = None) -> 
 
 def step(problem: Problem, state: PDHGState) -> PDHGState:
     """Sixteen iterations, one look at the bounds, and a restart of the lanes that earned one."""
-    first = _iterate(problem, state, 0)
-    start_residual = jnp.where(state.round_steps == 0, first[2], state.first_residual)
 
     def advance(k, carry):
-        primal, dual, _, _, _ = carry
+        primal, dual, first_residual, _, _, _ = carry
         moved = state.replace(primal=primal, dual=dual)
-        next_primal, next_dual, _, mapped_primal, mapped_dual = _iterate(problem, moved, k)
-        return next_primal, next_dual, carry[2], mapped_primal, mapped_dual
+        primal, dual, residual, mapped_primal, mapped_dual = _iterate(problem, moved, k)
+        starts_round = (state.round_steps == 0) & (k == 0)
+        first_residual = jnp.where(starts_round, residual, first_residual)
+        return primal, dual, first_residual, residual, mapped_primal, mapped_dual
 
-    primal, dual, _, mapped_primal, mapped_dual = jax.lax.fori_loop(
-        1, STEPS_PER_CHECK - 1, advance, first
+    start = (state.primal, state.dual, state.first_residual, state.last_residual)
+    primal, dual, first_residual, residual, mapped_primal, mapped_dual = jax.lax.fori_loop(
+        0, STEPS_PER_CHECK, advance, (*start, state.primal, state.dual)
     )
-    last = _iterate(problem, state.replace(primal=primal, dual=dual), STEPS_PER_CHECK - 1)
-    primal, dual, residual, mapped_primal, mapped_dual = last
     state = state.replace(
         primal=primal,
         dual=dual,
         round_steps=state.round_steps + STEPS_PER_CHECK,
         steps=state.steps + STEPS_PER_CHECK,
-        first_residual=start_residual,
+        first_residual=first_residual,
     )
     state = _update_bounds(problem, state, mapped_primal, mapped_dual)
     return _restart(state, residual, mapped_primal, mapped_dual)
@@ -259,7 +260,7 @@ def _restart(state: PDHGState, residual, primal, dual) -> PDHGState:
 
 def _square_norm(array: jax.Array) -> jax.Array:
     """Sum of squares per lane."""
-    return (array * array).sum(axis=tuple(range(array.ndim - 1)))
+    return reduce_leading(array * array, tuple(range(array.ndim - 1)))
 
 
 def _operator_norm(problem: Problem, like: jax.Array) -> jax.Array:

@@ -1,50 +1,85 @@
-"""Euclidean projections without sorting, over leading axes of batch-last arrays.
+"""Euclidean projections without sorting, lanes last, and the sums over leading axes that they are made of.
 
-Each finds a threshold by Newton's method on a convex piecewise linear function, from the larger of two lower bounds
-(all entries above the threshold; the largest entry alone), which is exact after a few steps. On XLA's CPU backend this is several times faster than the usual sort, if the steps stand in a loop of their
-own: outside one, XLA fuses whatever produced the argument into every step and computes it again.
+Each projection finds a threshold by Newton's method on a convex piecewise linear function, from the larger of two
+lower bounds (all entries above the threshold; the largest entry alone), which is exact after a few steps. On XLA's CPU
+backend this is many times faster than the usual sort, given two things. Sums over leading axes are written out,
+because a `reduce` whose kept axis is the last is not vectorised. And the steps stand in a loop of their own: outside
+one, XLA fuses whatever produced the argument into every step and computes it again.
 """
+
+import functools
+import operator
 
 import jax
 import jax.numpy as jnp
 
+_MAX_TERMS = 32
+
+
+def reduce_leading(array: jax.Array, axes: tuple[int, ...], operation=operator.add) -> jax.Array:
+    """Reduces over `axes`, one after another, as a written-out chain while an axis is short; [..., lanes] kept."""
+    for axis in sorted(axes, reverse=True):
+        length = array.shape[axis]
+        if length <= _MAX_TERMS:
+            parts = [jax.lax.index_in_dim(array, i, axis, keepdims=False) for i in range(length)]
+            array = functools.reduce(operation, parts)
+        else:
+            array = (jnp.sum if operation is operator.add else jnp.max)(array, axis=axis)
+    return array
+
 
 def project_simplex(point: jax.Array, total: jax.Array | float = 1.0, *, axis: int = 0) -> jax.Array:
     """argmin_x |x - point|^2 subject to x >= 0, sum(x, axis) = total; `total` broadcasts against the sum."""
-    count = point.shape[axis]
-    mean_excess = (point.sum(axis=axis, keepdims=True) - total) / count
-    threshold = jnp.maximum(mean_excess, point.max(axis=axis, keepdims=True) - total)
 
-    def newton(_, threshold):
-        above = point > threshold
-        number = jnp.maximum(above.sum(axis=axis, keepdims=True), 1).astype(point.dtype)
-        mass = jnp.where(above, point - threshold, 0.0).sum(axis=axis, keepdims=True)
-        return threshold + (mass - total) / number
+    def project(point):
+        threshold = _threshold(point, total, (axis,))
+        return jnp.maximum(point - jnp.expand_dims(threshold, axis), 0.0)
 
-    threshold = jax.lax.fori_loop(0, _newton_steps(count), newton, threshold)
-    return jnp.maximum(point - threshold, 0.0)
+    return _compute_once(project, point)
 
 
 def project_l1_ball(point: jax.Array, *, axes: tuple[int, ...]) -> jax.Array:
     """argmin_y |y - point|^2 subject to sum(|y|, axes) <= 1."""
-    size = jnp.abs(point)
+
+    def project(point):
+        size = jnp.abs(point)
+        threshold = jnp.maximum(_threshold(size, 1.0, axes), 0.0)
+        return jnp.sign(point) * jnp.maximum(size - jnp.expand_dims(threshold, axes), 0.0)
+
+    return _compute_once(project, point)
+
+
+def _compute_once(project, point: jax.Array) -> jax.Array:
+    """project(point), with `point` written to memory first.
+
+    The branch is always taken, but XLA does not know: the operand of a conditional must exist as an array.
+    """
+    is_number = point.ravel()[0] > -jnp.inf
+    return jax.lax.cond(is_number, project, lambda point: jnp.full_like(point, jnp.nan), point)
+
+
+def _threshold(point: jax.Array, total, axes: tuple[int, ...]) -> jax.Array:
+    """The root t of sum(max(point - t, 0), axes) = total, from below."""
     count = 1
     for axis in axes:
         count *= point.shape[axis]
-    norm = size.sum(axis=axes, keepdims=True)
-    threshold = jnp.maximum((norm - 1.0) / count, size.max(axis=axes, keepdims=True) - 1.0)
-    threshold = jnp.maximum(threshold, 0.0)
+    mean_excess = (reduce_leading(point, axes) - total) / count
+    largest = reduce_leading(point, axes, jnp.maximum)
+    start = jnp.maximum(mean_excess, largest - total)
+    rounding = 4.0 * jnp.finfo(point.dtype).eps * (1.0 + jnp.abs(start))
 
-    def newton(_, threshold):
-        above = size > threshold
-        number = jnp.maximum(above.sum(axis=axes, keepdims=True), 1).astype(point.dtype)
-        mass = jnp.where(above, size - threshold, 0.0).sum(axis=axes, keepdims=True)
-        return jnp.maximum(threshold + (mass - 1.0) / number, 0.0)
+    def keep_going(carry):
+        step, _, excess = carry
+        return (step < count) & jnp.any(excess > rounding)
 
-    threshold = jax.lax.fori_loop(0, _newton_steps(count), newton, threshold)
-    return jnp.sign(point) * jnp.maximum(size - threshold, 0.0)
+    def newton(carry):
+        step, threshold, _ = carry
+        excess = point - jnp.expand_dims(threshold, axes)
+        above = (excess > 0).astype(point.dtype)
+        number = jnp.maximum(reduce_leading(above, axes), 1.0)
+        mass = reduce_leading(jnp.maximum(excess, 0.0), axes)
+        change = (mass - total) / number
+        return step + 1, threshold + change, change
 
-
-def _newton_steps(count: int) -> int:
-    """Steps that reach rounding in practice; the exact worst case is `count`, what is left over is a short step."""
-    return min(count, 4 + count.bit_length())
+    first = (jnp.zeros((), jnp.int32), start, jnp.full_like(start, jnp.inf))
+    return jax.lax.while_loop(keep_going, newton, first)[1]

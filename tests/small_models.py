@@ -1,0 +1,110 @@
+"""Small models for the tests, as jaxhom's `MDP` beside the plain NumPy arrays that it was built from.
+
+Each is the smallest that reaches one path of the code: LU or Krylov solves, dense or successor layout, rows of
+successors and of predecessors that are wider than most.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import oracles
+
+from jaxhom.mdp import MDP
+
+
+class Case(NamedTuple):
+    """A model twice; `arrays` are what the oracles take."""
+
+    name: str
+    mdp: MDP
+    transition: np.ndarray
+    discount: float
+    initial: np.ndarray
+    features: np.ndarray
+
+    @property
+    def arrays(self):
+        return self.transition, self.discount, self.initial, self.features
+
+    @property
+    def shape(self):
+        return self.features.shape[:2]
+
+
+def random_policy(rng, *shape):
+    """Policy [..., S, A] with flat Dirichlet rows."""
+    return rng.dirichlet(np.ones(shape[-1]), size=shape[:-1])
+
+
+@functools.cache
+def case(name: str) -> Case:
+    transition, discount, initial, features = _BUILDERS[name]()
+    mdp = MDP.from_dense(transition, discount=discount, initial=initial, features=features)
+    return Case(name, mdp, transition, discount, initial, features)
+
+
+def in_float32(case: Case) -> Case:
+    """The model rounded to float32; the arrays are those rounded numbers, in float64."""
+    rounded = [array.astype(np.float32) for array in (case.transition, case.initial, case.features)]
+    transition, initial, features = rounded
+    mdp = MDP.from_dense(
+        transition, discount=case.discount, initial=initial, features=features
+    )
+    discount = float(np.float32(case.discount))
+    return Case(case.name, mdp, transition.astype(float), discount, initial.astype(float), features)
+
+
+def _random(seed, *args, **kwargs):
+    return oracles.random_mdp(np.random.default_rng(seed), *args, **kwargs)
+
+
+def absorbing():
+    """Deterministic: 0 -> 1 -> 2, which absorbs; action 1 stays. 3 is unreachable, 4 and 5 alternate."""
+    step = [(1, 0), (2, 1), (2, 2), (0, 4), (5, 5), (4, 4)]
+    transition = np.eye(6)[np.array(step)]
+    initial = np.array([0.5, 0.25, 0.0, 0.0, 0.25, 0.0])
+    features = np.random.default_rng(6).uniform(-1, 1, size=(6, 2, 3))
+    return transition, 0.9, initial, features
+
+
+def restart():
+    """A noisy ring; five pairs restart among 24 states (wide rows), all others reach 0 (wide column)."""
+    num_states, num_actions = 100, 3
+    rng = np.random.default_rng(7)
+    transition = np.zeros((num_states, num_actions, num_states))
+    for s in range(num_states):
+        for action, move in enumerate((1, -1, 2)):
+            transition[s, action, (s + move) % num_states] += 0.8
+            transition[s, action, (s + 5) % num_states] += 0.1
+            transition[s, action, 0] += 0.1
+    transition[95:, 2] = 0.0
+    transition[95:, 2, 10:34] = rng.dirichlet(np.ones(24), size=5)
+    features = rng.uniform(size=(num_states, num_actions, 2))
+    return transition, 0.99, np.eye(num_states)[3], features
+
+
+def slow_ring():
+    """A ring of 72 states that hardly mixes, with discount 0.999."""
+    num_states = 72
+    transition = np.zeros((num_states, 2, num_states))
+    for s in range(num_states):
+        for action, step in enumerate((-1, 1)):
+            transition[s, action, (s + step) % num_states] += 0.95
+            transition[s, action, (s - step) % num_states] += 0.05
+    features = np.random.default_rng(8).uniform(size=(num_states, 2, 2))
+    return transition, 0.999, np.eye(num_states)[0], features
+
+
+_BUILDERS = {
+    "one_state": lambda: _random(1, 1, 1, K=2),
+    "one_action": lambda: _random(2, 5, 1, K=2),
+    "dense": lambda: _random(3, 7, 3, K=2),
+    "absorbing": absorbing,
+    "sparse": lambda: _random(4, 40, 3, N=4, K=2),
+    "krylov": lambda: _random(5, 80, 3, N=4, K=2, discount=0.95),
+    "restart": restart,
+    "slow_ring": slow_ring,
+    "dense_krylov": lambda: _random(9, 258, 2, K=2),
+}
+NAMES = tuple(_BUILDERS)

@@ -1,0 +1,339 @@
+"""The model: its two layouts, the one-step maps held to dense NumPy products, and what the constructors refuse."""
+
+import re
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import small_models
+
+from jaxhom.mdp import MDP, expected_next_value, push_forward, state_transition
+
+
+def as_successors(transition, rng, extra=2):
+    """Successor lists in random order, each successor split in two, padded by `extra` slots of junk."""
+    num_states, num_actions, _ = transition.shape
+    width = 2 * int((transition > 0).sum(axis=-1).max()) + extra
+    next_state = rng.integers(0, num_states, size=(num_states, num_actions, width))
+    probability = np.zeros(next_state.shape)
+    for s, a in np.ndindex(num_states, num_actions):
+        successors = np.flatnonzero(transition[s, a])
+        slots = rng.permutation(width)[: 2 * len(successors)]
+        next_state[s, a, slots] = np.repeat(successors, 2)
+        probability[s, a, slots] = np.repeat(transition[s, a, successors] / 2, 2)
+    return next_state, probability
+
+
+# ---------------------------------------------------------------------------------- the layouts
+
+
+@pytest.mark.parametrize(
+    ("name", "is_dense", "has_wide_pairs", "has_wide_rows"),
+    [
+        ("dense", True, False, False),
+        ("sparse", False, False, False),
+        ("restart", False, True, True),
+        ("slow_ring", False, False, False),
+        ("dense_krylov", True, False, False),
+    ],
+)
+def test_layout(name, is_dense, has_wide_pairs, has_wide_rows):
+    mdp = small_models.case(name).mdp
+    assert mdp.is_dense == is_dense
+    assert (mdp.wide_pairs.size > 0) == has_wide_pairs
+    assert mdp.is_dense or (mdp.predecessors.wide_row.size > 0) == has_wide_rows
+
+
+def test_restart_rows_alone_are_wide():
+    mdp = small_models.case("restart").mdp
+    assert mdp.narrow_width == 3
+    np.testing.assert_array_equal(mdp.wide_pairs, 3 * np.arange(95, 100) + 2)
+    np.testing.assert_array_equal(mdp.predecessors.wide_row, [0])
+
+
+def test_sizes_dtype_and_fields(case):
+    num_states, num_actions = case.shape
+    mdp = case.mdp
+    assert (mdp.num_states, mdp.num_actions) == case.shape
+    assert mdp.num_features == case.features.shape[-1]
+    assert mdp.dtype == jnp.float64
+    chex.assert_shape(mdp.transition, (num_states, num_actions, num_states))
+    chex.assert_trees_all_equal(mdp.initial, case.initial)
+    chex.assert_trees_all_equal(mdp.features, case.features)
+    assert float(mdp.discount) == case.discount
+
+
+def test_transition_is_given_back(case):
+    np.testing.assert_array_equal(case.mdp.transition, case.transition)
+
+
+def test_successors_in_any_order_repeated_and_padded_make_the_same_model(case, rng):
+    if case.name == "dense_krylov":
+        pytest.skip("nothing new, and slow to list")
+    mdp = MDP.from_successors(
+        *as_successors(case.transition, rng),
+        discount=case.discount,
+        initial=case.initial,
+        features=case.features,
+    )
+    chex.assert_trees_all_close(mdp, case.mdp, rtol=1e-15)
+
+
+def test_successors_ascend_and_padding_is_last():
+    mdp = small_models.case("restart").mdp
+    inside = np.asarray(mdp.probability > 0)
+    assert np.all(inside[..., :-1] >= inside[..., 1:])
+    ascends = np.diff(mdp.next_state, axis=-1) > 0
+    assert np.all(ascends | ~inside[..., 1:])
+    assert np.all(np.asarray(mdp.next_state)[~inside] == 0)
+
+
+def test_features_of_states_hold_for_every_action():
+    features = np.arange(6.0).reshape(3, 2)
+    mdp = MDP.from_dense(np.full((3, 4, 3), 1 / 3), discount=0.9, features=features)
+    np.testing.assert_array_equal(mdp.features, np.repeat(features[:, None], 4, axis=1))
+
+
+def test_initial_is_uniform_and_features_are_empty_by_default():
+    mdp = MDP.from_dense(np.full((4, 2, 4), 0.25), discount=0.9)
+    np.testing.assert_array_equal(mdp.initial, np.full(4, 0.25))
+    chex.assert_shape(mdp.features, (4, 2, 0))
+
+
+@pytest.mark.parametrize(
+    ("transition", "expected"),
+    [
+        (np.ones((1, 1, 1), int), jnp.float64),
+        (np.ones((1, 1, 1), np.float32), jnp.float32),
+        ([[[1.0]]], jnp.float64),
+        (jnp.ones((1, 1, 1), jnp.float32), jnp.float32),
+    ],
+)
+def test_dtype_follows_the_transition(transition, expected):
+    mdp = MDP.from_dense(transition, discount=0.9, features=np.ones((1, 2)))
+    assert {mdp.dtype, mdp.initial.dtype, mdp.features.dtype, mdp.discount.dtype} == {
+        jnp.dtype(expected)
+    }
+
+
+def test_replace_exchanges_arrays_and_keeps_the_rest():
+    mdp = small_models.case("dense").mdp
+    other = mdp.replace(discount=jnp.asarray(0.5))
+    assert float(other.discount) == 0.5 and other.probability is mdp.probability
+
+
+def test_model_is_a_pytree_that_passes_through_jit():
+    for name in ("dense", "restart"):
+        mdp = small_models.case(name).mdp
+        chex.assert_trees_all_equal(jax.jit(lambda mdp: mdp)(mdp), mdp)
+
+
+# ----------------------------------------------------------------------------- the one-step maps
+
+
+class SweepsTest(chex.TestCase):
+    """Both maps against dense products, compiled and not, with and without a trailing batch."""
+
+    @chex.variants(with_jit=True, without_jit=True)
+    def test_backward_and_forward(self):
+        for name in ("one_state", "dense", "sparse", "restart"):
+            case = small_models.case(name)
+            rng = np.random.default_rng(1)
+            num_states, num_actions = case.shape
+            for batch in ((), (5,)):
+                value = rng.normal(size=(num_states, *batch))
+                x = rng.normal(size=(num_states, num_actions, *batch))
+                backward = self.variant(expected_next_value)(case.mdp, value)
+                forward = self.variant(push_forward)(case.mdp, x)
+                expected = np.einsum("saz,z...->sa...", case.transition, value)
+                np.testing.assert_allclose(backward, expected, rtol=0, atol=1e-13)
+                expected = np.einsum("saz,sa...->z...", case.transition, x)
+                np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-12)
+
+
+def test_sweeps_of_every_model(case, rng):
+    value, x = rng.normal(size=case.shape[0]), rng.normal(size=case.shape)
+    backward = jax.jit(expected_next_value)(case.mdp, value)
+    np.testing.assert_allclose(backward, case.transition @ value, rtol=0, atol=1e-13)
+    forward = jax.jit(push_forward)(case.mdp, x)
+    expected = np.einsum("saz,sa->z", case.transition, x)
+    np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-12)
+
+
+def test_sweeps_in_float32():
+    case = small_models.in_float32(small_models.case("restart"))
+    value = np.random.default_rng(1).normal(size=100).astype(np.float32)
+    swept = expected_next_value(case.mdp, value)
+    assert swept.dtype == jnp.float32
+    np.testing.assert_allclose(swept, case.transition @ value, rtol=0, atol=1e-6)
+
+
+def test_vmapped_sweeps_agree_with_the_trailing_batch(rng):
+    mdp = small_models.case("restart").mdp
+    value, x = rng.normal(size=(100, 5)), rng.normal(size=(100, 3, 5))
+    for sweep, batch in ((expected_next_value, value), (push_forward, x)):
+        by_vmap = jax.vmap(sweep, in_axes=(None, -1), out_axes=-1)(mdp, batch)
+        chex.assert_trees_all_close(by_vmap, sweep(mdp, batch), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["dense", "sparse", "restart"])
+def test_state_transition(name, rng):
+    case = small_models.case(name)
+    policy = small_models.random_policy(rng, *case.shape)
+    expected = np.einsum("sa,saz->sz", policy, case.transition)
+    np.testing.assert_allclose(state_transition(case.mdp, policy), expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["dense", "restart"])
+def test_derivative_in_the_probabilities_is_the_transpose(name, rng):
+    """d <x, T v> / dT is x(s, a) v(s') on the entries of T, whichever map it is computed by."""
+    case = small_models.case(name)
+    mdp, value, x = case.mdp, rng.normal(size=case.shape[0]), rng.normal(size=case.shape)
+
+    def by_backward(probability):
+        return jnp.vdot(x, expected_next_value(mdp.replace(probability=probability), value))
+
+    def by_forward(probability):
+        return jnp.vdot(push_forward(mdp.replace(probability=probability), x), value)
+
+    inside = np.asarray(mdp.probability > 0)
+    expected = x[..., None] * value[np.asarray(mdp.next_state)]
+    for function in (by_backward, by_forward):
+        gradient = np.asarray(jax.grad(function)(mdp.probability))
+        np.testing.assert_allclose(gradient[inside], expected[inside], rtol=0, atol=1e-14)
+
+
+def test_one_compilation_serves_all_models_of_one_shape(rng):
+    chex.clear_trace_counter()
+    sweep = jax.jit(chex.assert_max_traces(expected_next_value, n=1))
+    mdp = small_models.case("restart").mdp
+    for discount in (0.5, 0.9):
+        other = mdp.replace(discount=jnp.asarray(discount), probability=mdp.probability * discount)
+        sweep(other, rng.normal(size=100))
+
+
+# ---------------------------------------------------------------------------------- what is refused
+
+
+def changed(array, index, value):
+    array = np.array(array)
+    array[index] = value
+    return array
+
+
+HALF = np.full((2, 2, 2), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("transition", "message"),
+    [
+        (np.eye(2), "transition must have shape [S, A, S] with S, A >= 1, got (2, 2)"),
+        (np.full((3, 2, 2), 0.5), "with S, A >= 1, got (3, 2, 2)"),
+        (np.zeros((0, 2, 0)), "with S, A >= 1, got (0, 2, 0)"),
+        (np.zeros((2, 0, 2)), "with S, A >= 1, got (2, 0, 2)"),
+        (1.0, "with S, A >= 1, got ()"),
+        ([[[1.0, 0.0]], [[1.0]]], "transition is not a rectangular array"),
+        (changed(HALF, (1, 0, 1), np.nan), "transition[1, 0, 1] must be finite, got nan"),
+        (changed(HALF, (0, 1, 0), np.inf), "transition[0, 1, 0] must be finite, got inf"),
+        (changed(HALF, (1, 1), (1.5, -0.5)), "transition[1, 1, 1] must not be negative, got -0.5"),
+        (changed(HALF, (1, 0, 1), 0.6), "sum of transition[1, 0] must be 1, got 1.1"),
+        (changed(HALF, (0, 1, 1), 0.4), "sum of transition[0, 1] must be 1, got 0.9"),
+        (HALF.astype(str), "transition must hold real numbers, got dtype <U"),
+        (HALF.astype(complex), "transition must hold real numbers, got dtype complex128"),
+    ],
+)
+def test_from_dense_refuses_transition(transition, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MDP.from_dense(transition, discount=0.9)
+
+
+@pytest.mark.parametrize(
+    ("discount", "message"),
+    [
+        (0.0, "discount must lie strictly between 0 and 1, got 0.0"),
+        (1.0, "discount must lie strictly between 0 and 1, got 1.0"),
+        (1, "discount must lie strictly between 0 and 1, got 1.0"),
+        (-0.5, "discount must lie strictly between 0 and 1, got -0.5"),
+        (np.nan, "discount must be finite, got nan"),
+        ([0.9, 0.9], "discount must have shape (), got (2,)"),
+        ("high", "discount must hold real numbers"),
+    ],
+)
+def test_constructors_refuse_discount(discount, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MDP.from_dense(HALF, discount=discount)
+
+
+@pytest.mark.parametrize(
+    ("initial", "message"),
+    [
+        ([1.0], "initial must have shape (2,), got (1,)"),
+        ([[0.5, 0.5]], "initial must have shape (2,), got (1, 2)"),
+        ([1.5, -0.5], "initial[1] must not be negative, got -0.5"),
+        ([0.5, 0.6], "sum of initial must be 1, got 1.1"),
+        ([0.5, np.nan], "initial[1] must be finite, got nan"),
+    ],
+)
+def test_constructors_refuse_initial(initial, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MDP.from_dense(HALF, discount=0.9, initial=initial)
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (np.zeros(2), "features must have shape (2, 2, K) or (2, K), got (2,)"),
+        (np.zeros((3, 4)), "features must have shape (2, 2, K) or (2, K), got (3, 4)"),
+        (np.zeros((2, 3, 4)), "features must have shape (2, 2, K) or (2, K), got (2, 3, 4)"),
+        (changed(np.zeros((2, 2, 3)), (0, 1, 2), np.nan), "features[0, 1, 2] must be finite"),
+        (changed(np.zeros((2, 3)), (1, 2), np.inf), "features[1, 2] must be finite, got inf"),
+    ],
+)
+def test_constructors_refuse_features(features, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MDP.from_dense(HALF, discount=0.9, features=features)
+
+
+STATES = np.zeros((2, 1, 2), int)
+CHANCES = np.full((2, 1, 2), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("next_state", "probability", "message"),
+    [
+        (STATES[0], CHANCES[0], "next_state must have shape [S, A, N] with S, A, N >= 1, got (1, 2)"),
+        (STATES[..., :0], CHANCES[..., :0], "with S, A, N >= 1, got (2, 1, 0)"),
+        (STATES, CHANCES[..., :1], "probability must have shape (2, 1, 2), got (2, 1, 1)"),
+        (changed(STATES, (1, 0, 1), 2), CHANCES, "next_state[1, 0, 1] must be below 2, got 2"),
+        (changed(STATES, (0, 0, 1), -1), CHANCES, "next_state[0, 0, 1] must not be negative"),
+        (STATES + 0.5, CHANCES, "next_state[0, 0, 0] must be whole, got 0.5"),
+        (STATES, changed(CHANCES, (1, 0, 0), np.nan), "probability[1, 0, 0] must be finite"),
+        (STATES, changed(CHANCES, (1, 0), (1.5, -0.5)), "probability[1, 0, 1] must not be negative"),
+        (STATES, changed(CHANCES, (1, 0, 0), 0.6), "sum of probability[1, 0] must be 1, got 1.1"),
+    ],
+)
+def test_from_successors_refuses(next_state, probability, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MDP.from_successors(next_state, probability, discount=0.9)
+
+
+@pytest.mark.parametrize("argument", ["transition", "discount", "initial", "features"])
+def test_traced_input_is_refused_with_the_remedy(argument):
+    concrete = {"transition": HALF, "discount": 0.9, "initial": [0.5, 0.5], "features": np.eye(2)}
+
+    def build(value):
+        return MDP.from_dense(**{**concrete, argument: value})
+
+    with pytest.raises(ValueError, match=rf"{argument} is a traced value.*\.replace"):
+        jax.jit(build)(jnp.asarray(concrete[argument]))
+
+
+def test_oracle_models_keep_their_zeros(rng):
+    """A random sparse model, built both ways, has the oracle's successors and no others."""
+    transition, discount, *_ = oracles.random_mdp(rng, 40, 3, N=4)
+    mdp = MDP.from_dense(transition, discount=discount)
+    chex.assert_shape(mdp.probability, (40, 3, 4))
+    np.testing.assert_array_equal(np.asarray(mdp.transition) > 0, transition > 0)

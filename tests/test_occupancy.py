@@ -1,0 +1,314 @@
+"""Occupancies, feature expectations and values against NumPy's solves; derivatives against complex steps.
+
+The oracles are compositions of rational functions, so f(x + ih d).imag / h is their derivative along d to
+rounding: a finite difference without cancellation.
+"""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import small_models
+
+from jaxhom import occupancy as occupancy_module
+from jaxhom.occupancy import feature_expectations, occupancy, policy_value
+
+SOLVERS = ["dense", "sparse", "krylov", "restart", "dense_krylov"]
+
+
+def expected_results(case, policy, reward):
+    """Occupancy, feature expectations and values by NumPy."""
+    return (
+        oracles.occupancy(*case.arrays[:3], policy),
+        oracles.feature_expectations(*case.arrays, policy),
+        oracles.policy_value(case.transition, case.discount, policy, reward),
+    )
+
+
+def results(mdp, policy, reward):
+    return (
+        occupancy(mdp, policy),
+        feature_expectations(mdp, policy),
+        policy_value(mdp, policy, reward),
+    )
+
+
+def assert_close_by_scale(actual, expected, tolerance):
+    """Largest difference below `tolerance` times the largest expected number."""
+    assert np.shape(actual) == np.shape(expected)
+    assert np.max(np.abs(actual - expected)) <= tolerance * np.max(np.abs(expected))
+
+
+# -------------------------------------------------------------------------------------- the numbers
+
+
+def test_models_reach_both_solvers():
+    small = [occupancy_module._is_small(small_models.case(name).mdp) for name in SOLVERS]
+    assert small == [True, True, False, False, False]
+
+
+def test_against_numpy(case, rng):
+    policy = small_models.random_policy(rng, *case.shape)
+    reward = rng.normal(size=case.shape)
+    actual = results(case.mdp, policy, reward)
+    for got, want in zip(actual, expected_results(case, policy, reward), strict=True):
+        assert_close_by_scale(np.asarray(got), want, 1e-10)
+    total = np.sum(actual[0])
+    np.testing.assert_allclose(total, 1 / (1 - case.discount), rtol=1e-10)
+
+
+def test_deterministic_policies(case, rng):
+    actions = rng.integers(case.shape[1], size=case.shape[0])
+    policy = np.eye(case.shape[1])[actions]
+    x = np.asarray(occupancy(case.mdp, policy))
+    assert_close_by_scale(x, oracles.occupancy(*case.arrays[:3], policy), 1e-10)
+    assert np.all(x >= 0) and np.all(x[policy == 0] == 0)
+
+
+def test_unreachable_states_have_no_occupancy_and_absorbing_ones_the_rest():
+    case = small_models.case("absorbing")
+    policy = np.eye(2)[[0, 0, 0, 0, 0, 0]]
+    state_occupancy = np.asarray(occupancy(case.mdp, policy)).sum(axis=1)
+    g = case.discount
+    absorbed = (0.5 * g**2 + 0.25 * g) / (1 - g)
+    pair = 0.25 / (1 - g**2)
+    expected = [0.5, 0.5 * g + 0.25, absorbed, 0.0, pair, g * pair]
+    np.testing.assert_allclose(state_occupancy, expected, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("name", ["sparse", "krylov", "dense_krylov"])
+@pytest.mark.parametrize("discount", [0.01, 0.999])
+def test_extreme_discounts(name, discount, rng):
+    case = small_models.case(name)._replace(discount=discount)
+    mdp = case.mdp.replace(discount=jnp.asarray(discount))
+    policy = small_models.random_policy(rng, *case.shape)
+    reward = rng.normal(size=case.shape)
+    actual, expected = results(mdp, policy, reward), expected_results(case, policy, reward)
+    for got, want in zip(actual, expected, strict=True):
+        assert_close_by_scale(np.asarray(got), want, 1e-9)
+
+
+@pytest.mark.parametrize("name", ["dense", "krylov"])
+def test_zero_reward_has_zero_value(name, rng):
+    case = small_models.case(name)
+    policy = small_models.random_policy(rng, *case.shape)
+    np.testing.assert_array_equal(policy_value(case.mdp, policy, np.zeros(case.shape)), 0)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("policy_dtype", [np.float32, np.float64])
+def test_float32_models_are_solved_in_float32(name, policy_dtype, rng):
+    case = small_models.in_float32(small_models.case(name))
+    policy = small_models.random_policy(rng, *case.shape).astype(policy_dtype)
+    reward = rng.uniform(size=case.shape)
+    expected = expected_results(case, policy.astype(np.float32).astype(float), reward)
+    for got, want in zip(results(case.mdp, policy, reward), expected, strict=True):
+        assert got.dtype == jnp.float32
+        assert_close_by_scale(np.asarray(got), want, 2e-6 / (1 - case.discount))
+
+
+@pytest.mark.parametrize("name", ["dense", "krylov"])
+def test_integers_and_lists_are_policies(name):
+    case = small_models.case(name)
+    one_hot = np.eye(case.shape[1], dtype=int)[np.zeros(case.shape[0], int)]
+    expected = occupancy(case.mdp, one_hot.astype(float))
+    chex.assert_trees_all_equal(occupancy(case.mdp, one_hot), expected)
+    chex.assert_trees_all_equal(occupancy(case.mdp, one_hot.tolist()), expected)
+
+
+@pytest.mark.parametrize("name", ["dense", "krylov", "dense_krylov"])
+def test_a_policy_with_nan_gives_nan_in_its_lane_alone(name, rng):
+    case = small_models.case(name)
+    policies = small_models.random_policy(rng, 2, *case.shape)
+    expected = oracles.occupancy(*case.arrays[:3], policies[1])
+    policies[0, 2, 0] = np.nan
+    x = np.asarray(occupancy(case.mdp, policies))
+    assert np.isnan(x[0]).all()
+    assert_close_by_scale(x[1], expected, 1e-10)
+
+
+# ---------------------------------------------------------------------------- batch, jit and vmap
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_batches_agree_with_single_policies_and_with_vmap(name, rng):
+    case = small_models.case(name)
+    policies = small_models.random_policy(rng, 3, *case.shape)
+    rewards = rng.normal(size=(3, *case.shape))
+    batched = results(case.mdp, policies, rewards)
+    chex.assert_shape(batched, [(3, *case.shape), (3, 2), (3, case.shape[0])])
+    singles = [results(case.mdp, p, r) for p, r in zip(policies, rewards, strict=True)]
+    stacked = jax.tree.map(lambda *lanes: jnp.stack(lanes), *singles)
+    chex.assert_trees_all_close(batched, stacked, rtol=1e-10, atol=1e-11)
+    mapped = jax.jit(jax.vmap(results, in_axes=(None, 0, 0)))(case.mdp, policies, rewards)
+    chex.assert_trees_all_close(batched, mapped, rtol=1e-10, atol=1e-11)
+
+
+def test_one_reward_serves_a_batch_of_policies(rng):
+    case = small_models.case("krylov")
+    policies, reward = small_models.random_policy(rng, 3, *case.shape), rng.normal(size=case.shape)
+    values = policy_value(case.mdp, policies, reward)
+    for policy, value in zip(policies, values, strict=True):
+        expected = oracles.policy_value(case.transition, case.discount, policy, reward)
+        assert_close_by_scale(np.asarray(value), expected, 1e-10)
+
+
+@pytest.mark.parametrize("name", ["dense", "krylov"])
+def test_vmapped_discounts(name, rng):
+    case = small_models.case(name)
+    policy, reward = small_models.random_policy(rng, *case.shape), rng.normal(size=case.shape)
+    discounts = np.array([0.1, 0.9, 0.99])
+    lanes = jax.vmap(lambda g: results(case.mdp.replace(discount=g), policy, reward))(discounts)
+    for i, discount in enumerate(discounts):
+        expected = expected_results(case._replace(discount=discount), policy, reward)
+        for got, want in zip(lanes, expected, strict=True):
+            assert_close_by_scale(np.asarray(got[i]), want, 1e-10)
+
+
+def test_one_trace_serves_all_models_and_policies_of_one_shape(rng):
+    chex.clear_trace_counter()
+    case = small_models.case("krylov")
+    solve = jax.jit(chex.assert_max_traces(feature_expectations, n=1))
+    for discount in (0.5, 0.9):
+        mdp = case.mdp.replace(discount=jnp.asarray(discount))
+        solve(mdp, small_models.random_policy(rng, *case.shape))
+
+
+# ----------------------------------------------------------------------------------- derivatives
+
+STEP = 1e-30
+
+
+def along(mdp, name, direction):
+    """The oracle's form of a direction in one of the inputs."""
+    if name != "probability":
+        return direction
+    dense = np.zeros((*mdp.probability.shape[:2], mdp.num_states))
+    s, a = np.ogrid[: mdp.num_states, : mdp.num_actions]
+    np.add.at(dense, (s[..., None], a[..., None], np.asarray(mdp.next_state)), direction)
+    return dense
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def gradients(function, mdp, inputs, weight):
+    def weighted(inputs):
+        inputs = dict(inputs)
+        policy, reward = inputs.pop("policy"), inputs.pop("reward")
+        model = mdp.replace(**inputs)
+        extra = (reward,) if function is policy_value else ()
+        return jnp.vdot(weight, function(model, policy, *extra))
+
+    return jax.grad(weighted)(inputs)
+
+
+def complex_step(case, function, inputs, weight, name, direction):
+    """Derivative of <weight, oracle> along `direction` in the input `name`."""
+    point = {**inputs, "probability": case.transition}
+    point[name] = point[name] + 1j * STEP * along(case.mdp, name, direction)
+    model = (point["probability"], point["discount"])
+    if function is occupancy:
+        result = oracles.occupancy(*model, point["initial"], point["policy"])
+    elif function is feature_expectations:
+        arguments = (point["initial"], point["features"], point["policy"])
+        result = oracles.feature_expectations(*model, *arguments)
+    else:
+        result = oracles.policy_value(*model, point["policy"], point["reward"])
+    return np.sum(weight * result.imag) / STEP
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("function", [occupancy, feature_expectations, policy_value])
+def test_gradients_against_complex_steps(name, function, rng):
+    """In policy, probabilities, initial distribution, features, discount and reward, along random directions."""
+    case = small_models.case(name)
+    mdp = case.mdp
+    inputs = {
+        "policy": small_models.random_policy(rng, *case.shape),
+        "reward": rng.normal(size=case.shape),
+        "probability": np.asarray(mdp.probability),
+        "initial": case.initial,
+        "features": case.features,
+        "discount": np.asarray(case.discount),
+    }
+    output = jax.eval_shape(function, mdp, *(inputs[n] for n in arguments_of(function)))
+    weight = rng.normal(size=output.shape)
+    gradient = gradients(function, mdp, inputs, weight)
+    for key, value in inputs.items():
+        direction = rng.normal(size=value.shape)
+        if key == "probability":
+            direction = direction * (value > 0)
+        expected = complex_step(case, function, inputs, weight, key, direction)
+        actual = np.vdot(gradient[key], direction)
+        scale = max(np.linalg.norm(gradient[key]), 1e-300)
+        assert abs(actual - expected) <= 1e-9 * scale * np.linalg.norm(direction), key
+        if key not in ("reward", "features", "initial"):
+            assert expected != 0, key
+
+
+def arguments_of(function):
+    return ("policy", "reward") if function is policy_value else ("policy",)
+
+
+@pytest.mark.parametrize("name", ["dense", "krylov"])
+def test_forward_mode_and_batched_gradients_agree_with_reverse_mode(name, rng):
+    case = small_models.case(name)
+    policies = small_models.random_policy(rng, 2, *case.shape)
+    direction, weight = rng.normal(size=policies.shape), rng.normal(size=2)
+
+    def weighted(policy):
+        return feature_expectations(case.mdp, policy) @ weight
+
+    singles = jnp.stack([jax.grad(weighted)(policy) for policy in policies])
+    batched = jax.grad(lambda policies: weighted(policies).sum())(policies)
+    chex.assert_trees_all_close(batched, singles, rtol=1e-9, atol=1e-10)
+    _, tangent = jax.jvp(weighted, (policies,), (direction,))
+    expected = jnp.einsum("bsa,bsa->b", singles, direction)
+    chex.assert_trees_all_close(tangent, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["dense", "krylov"])
+def test_second_derivative_in_the_discount(name, rng):
+    case = small_models.case(name)
+    policy, weight = small_models.random_policy(rng, *case.shape), rng.normal(size=2)
+
+    def weighted(discount):
+        return feature_expectations(case.mdp.replace(discount=discount), policy) @ weight
+
+    second = jax.grad(jax.grad(weighted))(case.discount)
+    first = [float(jax.grad(weighted)(case.discount + h)) for h in (-1e-5, 1e-5)]
+    np.testing.assert_allclose(second, (first[1] - first[0]) / 2e-5, rtol=1e-6)
+
+
+# ---------------------------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize("shape", [(7,), (3, 7), (7, 2), (6, 3), (2, 7, 2), (1, 2, 7, 3)])
+def test_policies_of_another_shape_are_refused(shape):
+    mdp = small_models.case("dense").mdp
+    message = rf"policy must have shape \(7, 3\) or \(B, 7, 3\), got \({', '.join(map(str, shape))}"
+    for function in (occupancy, feature_expectations):
+        with pytest.raises(ValueError, match=message):
+            function(mdp, np.ones(shape))
+    with pytest.raises(ValueError, match=message):
+        policy_value(mdp, np.ones(shape), np.ones((7, 3)))
+
+
+@pytest.mark.parametrize(
+    ("policy_shape", "reward_shape"),
+    [
+        ((7, 3), (7,)),
+        ((7, 3), (2, 7, 3)),
+        ((2, 7, 3), (3, 7, 3)),
+        ((1, 7, 3), (3, 7, 3)),
+        ((3, 7, 3), (1, 7, 3)),
+        ((2, 7, 3), (7, 2)),
+    ],
+)
+def test_rewards_of_another_shape_are_refused(policy_shape, reward_shape):
+    mdp = small_models.case("dense").mdp
+    with pytest.raises(ValueError, match=r"reward must have shape \(7, 3\) or the policy's, got"):
+        policy_value(mdp, np.ones(policy_shape) / 3, np.ones(reward_shape))

@@ -9,7 +9,7 @@ of it are two linear maps, both defined here and nowhere else:
 
 *Successor layout.* `next_state[S, A, N]` and `probability[S, A, N]` list the N successors of every pair, padded
 with probability 0. Rows wider than most (a restart anywhere on a track, say) would make every sweep pay for them,
-so slots beyond a narrow width are read for those few rows alone. The forward map reads the same numbers through
+so they are kept apart. The forward map reads the same numbers through
 their transpose, lists of (s, a, slot) entries per s', so that derivatives reach `probability` either way.
 
 *Dense layout.* Where N is near S the slots are the states themselves (`probability` is T) and both maps are
@@ -219,22 +219,44 @@ def expected_next_value(mdp: MDP, value: jax.Array) -> jax.Array:
     """The backward map: E[value(s') | s, a], [S] -> [S, A] or [S, B] -> [S, A, B]."""
     if mdp.is_dense:
         return jnp.tensordot(mdp.probability, value, axes=1)
-    width, batch = mdp.narrow_width, value.shape[1:]
-    expected = _gather_sum(mdp.next_state[..., :width], mdp.probability[..., :width], value)
-    if not mdp.wide_pairs.size:
-        return expected
-    slots = mdp.next_state.shape[-1]
-    rest_state = mdp.next_state.reshape(-1, slots)[mdp.wide_pairs, width:]
-    rest_probability = mdp.probability.reshape(-1, slots)[mdp.wide_pairs, width:]
-    rest = _gather_sum(rest_state, rest_probability, value)
-    flat = expected.reshape((-1, *batch)).at[mdp.wide_pairs].add(rest)
-    return flat.reshape(expected.shape)
+    return jnp.stack(expected_next_values(mdp, value), axis=1)
+
+
+def expected_next_values(mdp: MDP, value: jax.Array) -> list[jax.Array]:
+    """The backward map action by action: A arrays E[value(s') | s, a], each [S] or [S, B].
+
+    What sweeps run on: a maximum or average over actions that is written out over this list stays in one vectorised
+    pass, where one over the middle axis of `expected_next_value` does not.
+    """
+    if mdp.is_dense:
+        return list(jnp.moveaxis(expected_next_value(mdp, value), 1, 0))
+    if value.ndim == 2 and value.shape[1] == 1:  # gathers of single numbers, not of rows of one
+        return [expected[:, None] for expected in expected_next_values(mdp, value[:, 0])]
+    width, slots = mdp.narrow_width, mdp.next_state.shape[-1]
+    index, weight = mdp.next_state[..., :width], mdp.probability[..., :width]
+    if mdp.wide_pairs.size:
+        # A wide row's expectation is computed beside the states' values and looked up like one more state.
+        rows = mdp.next_state.reshape(-1, slots)[mdp.wide_pairs]
+        expectation = _gather_sum(rows, mdp.probability.reshape(-1, slots)[mdp.wide_pairs], value)
+        lookup = mdp.num_states + jnp.arange(mdp.wide_pairs.size, dtype=index.dtype)
+        first = jnp.arange(width) == 0
+        index = _replace_pairs(index, mdp.wide_pairs, jnp.where(first, lookup[:, None], 0))
+        weight = _replace_pairs(weight, mdp.wide_pairs, first.astype(weight.dtype))
+        value = jnp.concatenate([value, expectation])
+    return [_gather_sum(index[:, a], weight[:, a], value) for a in range(mdp.num_actions)]
+
+
+def _replace_pairs(rows: jax.Array, pairs: jax.Array, replacement: jax.Array) -> jax.Array:
+    """`rows` [S, A, W] with those of the given flat pairs exchanged."""
+    return rows.reshape(-1, rows.shape[-1]).at[pairs].set(replacement).reshape(rows.shape)
 
 
 def push_forward(mdp: MDP, occupancy: jax.Array) -> jax.Array:
     """The forward map: sum_{s, a} x(s, a) T(s, a, s'), [S, A] -> [S] or [S, A, B] -> [S, B]."""
     if mdp.is_dense:
         return jnp.tensordot(mdp.probability, occupancy, axes=((0, 1), (0, 1)))
+    if occupancy.ndim == 3 and occupancy.shape[2] == 1:
+        return push_forward(mdp, occupancy[..., 0])[:, None]
     rows, slots = mdp.predecessors, mdp.probability.shape[-1]
     flat = occupancy.reshape((-1, *occupancy.shape[2:]))
     entries = jnp.append(mdp.probability.ravel(), jnp.zeros((), mdp.dtype))  # the sentinel's 0

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxhom import checks
-from jaxhom.mdp import MDP, expected_next_value, push_forward, state_transition
+from jaxhom.mdp import MDP, expected_next_values, push_forward, state_transition
 
 _MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
 _MAX_LU_STATES_DENSE = 256  # ... and products with the dense tensor
@@ -142,7 +142,7 @@ def _sweeps(mdp: MDP, policy: jax.Array) -> tuple[Callable, Callable]:
         return push_forward(mdp, mu[:, None] * policy)
 
     def backward(value):
-        return (policy * expected_next_value(mdp, value)).sum(axis=1)
+        return sum(policy[:, a] * v for a, v in enumerate(expected_next_values(mdp, value)))
 
     return forward, backward
 

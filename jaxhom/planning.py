@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxhom import checks
-from jaxhom.mdp import MDP, expected_next_value
+from jaxhom.mdp import MDP, expected_next_value, expected_next_values
 
 _STALL = 16.0  # a span of this many roundings of the largest value is taken for converged
 
@@ -124,6 +124,10 @@ def _plan(mdp, reward, value, tolerance, *, max_iterations) -> Plan:
     def action_values(value):
         return reward + mdp.discount * expected_next_value(mdp, value)
 
+    def best_action_value(value):
+        backups = enumerate(expected_next_values(mdp, value))
+        return functools.reduce(jnp.maximum, [reward[:, a] + mdp.discount * v for a, v in backups])
+
     def keep_going(state):
         _, residual, _, count = state
         return jnp.any(residual > tolerance) & (count < max_iterations)
@@ -131,7 +135,7 @@ def _plan(mdp, reward, value, tolerance, *, max_iterations) -> Plan:
     def sweep(state):
         value, residual, iterations, count = state
         active = residual > tolerance
-        improved = action_values(value).max(axis=1)
+        improved = best_action_value(value)
         low, high = (improved - value).min(axis=0), (improved - value).max(axis=0)
         # A constant offset has no effect on the span; taking it out at once keeps the values at their scale.
         centred = improved + mdp.discount / (1.0 - mdp.discount) * 0.5 * (low + high)

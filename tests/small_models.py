@@ -102,9 +102,8 @@ _BUILDERS = {
     "dense": lambda: _random(3, 7, 3, K=2),
     "absorbing": absorbing,
     "sparse": lambda: _random(4, 40, 3, N=4, K=2),
-    "krylov": lambda: _random(5, 80, 3, N=4, K=2, discount=0.95),
     "restart": restart,
-    "slow_ring": slow_ring,
     "dense_krylov": lambda: _random(9, 258, 2, K=2),
+    "slow_ring": slow_ring,
 }
-NAMES = tuple(_BUILDERS)
+NAMES = tuple(name for name in _BUILDERS if name != "slow_ring")  # that one is for few tests

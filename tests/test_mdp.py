@@ -139,11 +139,11 @@ class SweepsTest(chex.TestCase):
 
     @chex.variants(with_jit=True, without_jit=True)
     def test_backward_and_forward(self):
-        for name in ("one_state", "dense", "sparse", "restart"):
+        for name in ("dense", "restart"):
             case = small_models.case(name)
             rng = np.random.default_rng(1)
             num_states, num_actions = case.shape
-            for batch in ((), (5,)):
+            for batch in ((), (1,), (5,)):
                 value = rng.normal(size=(num_states, *batch))
                 x = rng.normal(size=(num_states, num_actions, *batch))
                 backward = self.variant(expected_next_value)(case.mdp, value)
@@ -166,7 +166,7 @@ def test_sweeps_of_every_model(case, rng):
 def test_sweeps_in_float32():
     case = small_models.in_float32(small_models.case("restart"))
     value = np.random.default_rng(1).normal(size=100).astype(np.float32)
-    swept = expected_next_value(case.mdp, value)
+    swept = jax.jit(expected_next_value)(case.mdp, value)
     assert swept.dtype == jnp.float32
     np.testing.assert_allclose(swept, case.transition @ value, rtol=0, atol=1e-6)
 
@@ -175,8 +175,8 @@ def test_vmapped_sweeps_agree_with_the_trailing_batch(rng):
     mdp = small_models.case("restart").mdp
     value, x = rng.normal(size=(100, 5)), rng.normal(size=(100, 3, 5))
     for sweep, batch in ((expected_next_value, value), (push_forward, x)):
-        by_vmap = jax.vmap(sweep, in_axes=(None, -1), out_axes=-1)(mdp, batch)
-        chex.assert_trees_all_close(by_vmap, sweep(mdp, batch), atol=1e-13)
+        by_vmap = jax.jit(jax.vmap(sweep, in_axes=(None, -1), out_axes=-1))(mdp, batch)
+        chex.assert_trees_all_close(by_vmap, jax.jit(sweep)(mdp, batch), atol=1e-13)
 
 
 @pytest.mark.parametrize("name", ["dense", "sparse", "restart"])
@@ -191,7 +191,8 @@ def test_state_transition(name, rng):
 def test_derivative_in_the_probabilities_is_the_transpose(name, rng):
     """d <x, T v> / dT is x(s, a) v(s') on the entries of T, whichever map it is computed by."""
     case = small_models.case(name)
-    mdp, value, x = case.mdp, rng.normal(size=case.shape[0]), rng.normal(size=case.shape)
+    mdp = case.mdp
+    value, x = jnp.asarray(rng.normal(size=case.shape[0])), jnp.asarray(rng.normal(size=case.shape))
 
     def by_backward(probability):
         return jnp.vdot(x, expected_next_value(mdp.replace(probability=probability), value))
@@ -200,9 +201,9 @@ def test_derivative_in_the_probabilities_is_the_transpose(name, rng):
         return jnp.vdot(push_forward(mdp.replace(probability=probability), x), value)
 
     inside = np.asarray(mdp.probability > 0)
-    expected = x[..., None] * value[np.asarray(mdp.next_state)]
+    expected = np.asarray(x[..., None] * value[mdp.next_state])
     for function in (by_backward, by_forward):
-        gradient = np.asarray(jax.grad(function)(mdp.probability))
+        gradient = np.asarray(jax.jit(jax.grad(function))(mdp.probability))
         np.testing.assert_allclose(gradient[inside], expected[inside], rtol=0, atol=1e-14)
 
 

@@ -17,7 +17,7 @@ import small_models
 from jaxhom import occupancy as occupancy_module
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
 
-SOLVERS = ["dense", "sparse", "krylov", "restart", "dense_krylov"]
+SOLVERS = ["dense", "sparse", "restart", "dense_krylov"]
 
 
 def expected_results(case, policy, reward):
@@ -48,7 +48,7 @@ def assert_close_by_scale(actual, expected, tolerance):
 
 def test_models_reach_both_solvers():
     small = [occupancy_module._is_small(small_models.case(name).mdp) for name in SOLVERS]
-    assert small == [True, True, False, False, False]
+    assert small == [True, True, False, False]
 
 
 def test_against_numpy(case, rng):
@@ -80,7 +80,7 @@ def test_unreachable_states_have_no_occupancy_and_absorbing_ones_the_rest():
     np.testing.assert_allclose(state_occupancy, expected, rtol=1e-13, atol=0)
 
 
-@pytest.mark.parametrize("name", ["sparse", "krylov", "dense_krylov"])
+@pytest.mark.parametrize("name", ["sparse", "restart", "dense_krylov", "slow_ring"])
 @pytest.mark.parametrize("discount", [0.01, 0.999])
 def test_extreme_discounts(name, discount, rng):
     case = small_models.case(name)._replace(discount=discount)
@@ -92,18 +92,17 @@ def test_extreme_discounts(name, discount, rng):
         assert_close_by_scale(np.asarray(got), want, 1e-9)
 
 
-@pytest.mark.parametrize("name", ["dense", "krylov"])
+@pytest.mark.parametrize("name", ["dense", "restart"])
 def test_zero_reward_has_zero_value(name, rng):
     case = small_models.case(name)
     policy = small_models.random_policy(rng, *case.shape)
     np.testing.assert_array_equal(policy_value(case.mdp, policy, np.zeros(case.shape)), 0)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("policy_dtype", [np.float32, np.float64])
-def test_float32_models_are_solved_in_float32(name, policy_dtype, rng):
+@pytest.mark.parametrize("name", ["dense", "restart"])
+def test_float32_models_are_solved_in_float32_whatever_the_policy(name, rng):
     case = small_models.in_float32(small_models.case(name))
-    policy = small_models.random_policy(rng, *case.shape).astype(policy_dtype)
+    policy = small_models.random_policy(rng, *case.shape)
     reward = rng.uniform(size=case.shape)
     expected = expected_results(case, policy.astype(np.float32).astype(float), reward)
     for got, want in zip(results(case.mdp, policy, reward), expected, strict=True):
@@ -111,7 +110,7 @@ def test_float32_models_are_solved_in_float32(name, policy_dtype, rng):
         assert_close_by_scale(np.asarray(got), want, 2e-6 / (1 - case.discount))
 
 
-@pytest.mark.parametrize("name", ["dense", "krylov"])
+@pytest.mark.parametrize("name", ["dense", "restart"])
 def test_integers_and_lists_are_policies(name):
     case = small_models.case(name)
     one_hot = np.eye(case.shape[1], dtype=int)[np.zeros(case.shape[0], int)]
@@ -120,7 +119,7 @@ def test_integers_and_lists_are_policies(name):
     chex.assert_trees_all_equal(occupancy(case.mdp, one_hot.tolist()), expected)
 
 
-@pytest.mark.parametrize("name", ["dense", "krylov", "dense_krylov"])
+@pytest.mark.parametrize("name", ["dense", "restart"])
 def test_a_policy_with_nan_gives_nan_in_its_lane_alone(name, rng):
     case = small_models.case(name)
     policies = small_models.random_policy(rng, 2, *case.shape)
@@ -134,7 +133,7 @@ def test_a_policy_with_nan_gives_nan_in_its_lane_alone(name, rng):
 # ---------------------------------------------------------------------------- batch, jit and vmap
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", ["dense", "restart", "dense_krylov"])
 def test_batches_agree_with_single_policies_and_with_vmap(name, rng):
     case = small_models.case(name)
     policies = small_models.random_policy(rng, 3, *case.shape)
@@ -144,12 +143,13 @@ def test_batches_agree_with_single_policies_and_with_vmap(name, rng):
     singles = [results(case.mdp, p, r) for p, r in zip(policies, rewards, strict=True)]
     stacked = jax.tree.map(lambda *lanes: jnp.stack(lanes), *singles)
     chex.assert_trees_all_close(batched, stacked, rtol=1e-10, atol=1e-11)
-    mapped = jax.jit(jax.vmap(results, in_axes=(None, 0, 0)))(case.mdp, policies, rewards)
-    chex.assert_trees_all_close(batched, mapped, rtol=1e-10, atol=1e-11)
+    if name != "dense_krylov":  # one Krylov model is enough to wait for
+        mapped = jax.jit(jax.vmap(results, in_axes=(None, 0, 0)))(case.mdp, policies, rewards)
+        chex.assert_trees_all_close(batched, mapped, rtol=1e-10, atol=1e-11)
 
 
 def test_one_reward_serves_a_batch_of_policies(rng):
-    case = small_models.case("krylov")
+    case = small_models.case("restart")
     policies, reward = small_models.random_policy(rng, 3, *case.shape), rng.normal(size=case.shape)
     values = policy_value(case.mdp, policies, reward)
     for policy, value in zip(policies, values, strict=True):
@@ -157,7 +157,7 @@ def test_one_reward_serves_a_batch_of_policies(rng):
         assert_close_by_scale(np.asarray(value), expected, 1e-10)
 
 
-@pytest.mark.parametrize("name", ["dense", "krylov"])
+@pytest.mark.parametrize("name", ["dense", "restart"])
 def test_vmapped_discounts(name, rng):
     case = small_models.case(name)
     policy, reward = small_models.random_policy(rng, *case.shape), rng.normal(size=case.shape)
@@ -171,7 +171,7 @@ def test_vmapped_discounts(name, rng):
 
 def test_one_trace_serves_all_models_and_policies_of_one_shape(rng):
     chex.clear_trace_counter()
-    case = small_models.case("krylov")
+    case = small_models.case("restart")
     solve = jax.jit(chex.assert_max_traces(feature_expectations, n=1))
     for discount in (0.5, 0.9):
         mdp = case.mdp.replace(discount=jnp.asarray(discount))
@@ -220,9 +220,13 @@ def complex_step(case, function, inputs, weight, name, direction):
     return np.sum(weight * result.imag) / STEP
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("function", [occupancy, feature_expectations, policy_value])
-def test_gradients_against_complex_steps(name, function, rng):
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [(feature_expectations, name) for name in SOLVERS]
+    + [(policy_value, name) for name in SOLVERS]
+    + [(occupancy, "dense"), (occupancy, "restart")],
+)
+def test_gradients_against_complex_steps(function, name, rng):
     """In policy, probabilities, initial distribution, features, discount and reward, along random directions."""
     case = small_models.case(name)
     mdp = case.mdp
@@ -253,7 +257,7 @@ def arguments_of(function):
     return ("policy", "reward") if function is policy_value else ("policy",)
 
 
-@pytest.mark.parametrize("name", ["dense", "krylov"])
+@pytest.mark.parametrize("name", ["dense", "restart"])
 def test_forward_mode_and_batched_gradients_agree_with_reverse_mode(name, rng):
     case = small_models.case(name)
     policies = small_models.random_policy(rng, 2, *case.shape)
@@ -262,24 +266,26 @@ def test_forward_mode_and_batched_gradients_agree_with_reverse_mode(name, rng):
     def weighted(policy):
         return feature_expectations(case.mdp, policy) @ weight
 
-    singles = jnp.stack([jax.grad(weighted)(policy) for policy in policies])
-    batched = jax.grad(lambda policies: weighted(policies).sum())(policies)
+    derivative = jax.jit(jax.grad(weighted))
+    singles = jnp.stack([derivative(policy) for policy in policies])
+    batched = jax.jit(jax.grad(lambda policies: weighted(policies).sum()))(policies)
     chex.assert_trees_all_close(batched, singles, rtol=1e-9, atol=1e-10)
-    _, tangent = jax.jvp(weighted, (policies,), (direction,))
+    push = jax.jit(lambda *pair: jax.jvp(weighted, pair[:1], pair[1:])[1])
+    tangent = push(policies, direction)
     expected = jnp.einsum("bsa,bsa->b", singles, direction)
     chex.assert_trees_all_close(tangent, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["dense", "krylov"])
-def test_second_derivative_in_the_discount(name, rng):
-    case = small_models.case(name)
+def test_second_derivative_in_the_discount(rng):
+    case = small_models.case("dense")
     policy, weight = small_models.random_policy(rng, *case.shape), rng.normal(size=2)
 
     def weighted(discount):
         return feature_expectations(case.mdp.replace(discount=discount), policy) @ weight
 
-    second = jax.grad(jax.grad(weighted))(case.discount)
-    first = [float(jax.grad(weighted)(case.discount + h)) for h in (-1e-5, 1e-5)]
+    derivative = jax.jit(jax.grad(weighted))
+    second = jax.jit(jax.grad(derivative))(case.discount)
+    first = [float(derivative(case.discount + h)) for h in (-1e-5, 1e-5)]
     np.testing.assert_allclose(second, (first[1] - first[0]) / 2e-5, rtol=1e-6)
 
 

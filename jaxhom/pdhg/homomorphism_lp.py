@@ -75,7 +75,7 @@ class HomomorphismProblem:
         """Onto the maps: real rows on the simplex over real columns, the rest zero."""
         del step
         rows, columns = self._masks(point.shape)
-        masked = jnp.where(columns, point, -1e4)  # below any threshold
+        masked = jnp.where(columns, point, -1e30)  # below any threshold
         f = jnp.where(rows & columns, project_simplex(masked, axis=1), 0.0)
         if not self.anchored:
             return f

@@ -17,15 +17,25 @@ _MAX_TERMS = 32
 
 
 def reduce_leading(array: jax.Array, axes: tuple[int, ...], operation=operator.add) -> jax.Array:
-    """Reduces over `axes`, one after another, as a written-out chain while an axis is short; [..., lanes] kept."""
+    """Reduces over `axes`, none of them the last, as written-out chains of at most 32 terms at a time."""
     for axis in sorted(axes, reverse=True):
-        length = array.shape[axis]
-        if length <= _MAX_TERMS:
-            parts = [jax.lax.index_in_dim(array, i, axis, keepdims=False) for i in range(length)]
-            array = functools.reduce(operation, parts)
-        else:
-            array = (jnp.sum if operation is operator.add else jnp.max)(array, axis=axis)
+        array = _reduce_axis(array, axis, operation)
     return array
+
+
+def _reduce_axis(array: jax.Array, axis: int, operation) -> jax.Array:
+    length = array.shape[axis]
+    if length <= _MAX_TERMS:
+        parts = [jax.lax.index_in_dim(array, i, axis, keepdims=False) for i in range(length)]
+        return functools.reduce(operation, parts)
+    groups, rest = divmod(length, _MAX_TERMS)
+    head = jax.lax.slice_in_dim(array, 0, length - rest, axis=axis)
+    head = head.reshape(*array.shape[:axis], groups, _MAX_TERMS, *array.shape[axis + 1 :])
+    total = _reduce_axis(_reduce_axis(head, axis + 1, operation), axis, operation)
+    if not rest:
+        return total
+    tail = jax.lax.slice_in_dim(array, length - rest, length, axis=axis)
+    return operation(total, _reduce_axis(tail, axis, operation))
 
 
 def project_simplex(point: jax.Array, total: jax.Array | float = 1.0, *, axis: int = 0) -> jax.Array:

@@ -1,0 +1,86 @@
+"""LPAL: apprenticeship learning by linear programming (Syed, Bowling and Schapire 2008).
+
+Given expectations Vhat of the expert's features, find the policy with the largest margin,
+
+    v* = max_pi min_i V_i(pi) - Vhat_i = max_pi min_{w in simplex} w . (V(pi) - Vhat)
+
+(Boularias and Chaib-draa 2010, eqs. 2-5). Rewards are non-negative combinations of the features, so a policy of
+margin v is worth at least the expert's value plus v times the sum of the weights.
+
+`columns` plays the game over policies, `flow` runs PDHG on the linear program itself; both end in `certificate`,
+which computes the true margin of the policy that is returned and the best upper bound.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.lpal.certificate import LPALSolution
+from jaxhom.lpal.columns import solve_by_columns
+from jaxhom.lpal.flow import solve_by_flow
+from jaxhom.mdp import MDP
+from jaxhom.occupancy import check_policy_shape
+
+_METHODS = {"columns": solve_by_columns, "flow": solve_by_flow}
+
+__all__ = ["LPALSolution", "lpal"]
+
+
+def lpal(
+    mdp: MDP,
+    expectations: jax.Array,
+    *,
+    initial_policy: jax.Array | None = None,
+    tolerance: float | None = None,
+    method: str = "columns",
+    max_iterations: int | None = None,
+    progress: bool = False,
+) -> LPALSolution:
+    """Finds the policy whose feature expectations exceed the given ones by the largest margin.
+
+    Args:
+      mdp: the model, with K >= 1 features.
+      expectations: [K] or a batch [B, K], discounted feature expectations Vhat of the expert, in the units of
+        `feature_expectations` (sums over time, not averages per step). No policy need reach them.
+      initial_policy: [S, A] or [B, S, A], a good guess: the policy that the expectations came from, for one.
+      tolerance: largest certified gap margin_bound - margin to settle for; by default
+        1e-5 / (1 - discount) times the largest |feature|.
+      method: "columns", or "flow" for PDHG on the linear program: slower, an independent second opinion.
+      max_iterations: columns (default 500) or PDHG iterations (default 20,000) after which to stop; `status` tells.
+      progress: show a progress bar of the largest gap.
+
+    Returns:
+      `LPALSolution`, with a leading axis [B] if the expectations have one. Its bounds hold whatever the status.
+
+    Raises:
+      ValueError: on wrong shapes, expectations that are not finite, a model without features, an unknown method.
+
+    Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
+    """
+    if method not in _METHODS:
+        raise ValueError(f"method must be one of {tuple(_METHODS)}, got {method!r}")
+    if not mdp.num_features:
+        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+    if checks.is_traced(mdp, expectations, initial_policy):
+        raise ValueError("lpal adds columns on the host: call it outside jit, vmap and grad, in batches [B, K]")
+    host = checks.as_host_array("expectations", expectations)
+    good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features
+    checks.require_shape("expectations", host, f"({mdp.num_features},) or (B, {mdp.num_features})", good)
+    host = checks.require_floats("expectations", host)
+    batch = jnp.asarray(np.atleast_2d(host), mdp.dtype)
+    if initial_policy is not None:
+        initial_policy = jnp.asarray(initial_policy, mdp.dtype)
+        check_policy_shape(mdp, initial_policy, "initial_policy")
+        fits = initial_policy.ndim == 2 or len(initial_policy) == len(batch)
+        checks.require_shape("initial_policy", initial_policy, f"({len(batch)}, S, A)", fits)
+        shape = (len(batch), *initial_policy.shape[-2:])
+        initial_policy = jnp.broadcast_to(initial_policy, shape)
+    if tolerance is None:
+        scale = float(jnp.abs(mdp.features).max())
+        tolerance = 1e-5 / (1.0 - float(mdp.discount)) * (scale or 1.0)
+    elif not tolerance > 0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    options = {} if max_iterations is None else {"max_iterations": max_iterations}
+    solution = _METHODS[method](mdp, batch, initial_policy, tolerance, progress=progress, **options)
+    return solution if host.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], solution)

@@ -1,0 +1,287 @@
+"""Demonstrations: padding, frequencies and eq. (6) against plain loops; sampling against its distribution."""
+
+import re
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import small_models
+
+from jaxhom.demonstrations import (
+    Demonstrations,
+    empirical_policy,
+    monte_carlo_feature_expectations,
+    sample_demonstrations,
+)
+from jaxhom.mdp import MDP
+
+RAGGED = [([0, 1, 2], [0, 2, 1]), ([4], [1]), ([1, 1, 1, 6, 0], [2, 2, 0, 1, 1])]
+
+
+# ---------------------------------------------------------------------------- ragged trajectories
+
+
+def test_ragged_trajectories_are_padded_and_masked():
+    demonstrations = Demonstrations.from_trajectories(RAGGED)
+    assert (demonstrations.num_trajectories, demonstrations.horizon) == (3, 5)
+    for i, (states, actions) in enumerate(RAGGED):
+        length = len(states)
+        np.testing.assert_array_equal(demonstrations.mask[i], np.arange(5) < length)
+        np.testing.assert_array_equal(demonstrations.states[i, :length], states)
+        np.testing.assert_array_equal(demonstrations.actions[i, :length], actions)
+        assert not np.any(demonstrations.states[i, length:])
+        assert not np.any(demonstrations.actions[i, length:])
+    chex.assert_type([demonstrations.states, demonstrations.actions], jnp.int32)
+    chex.assert_type(demonstrations.mask, bool)
+
+
+@pytest.mark.parametrize(
+    "trajectories",
+    [
+        iter([((0.0, 3.0), (1.0, 1.0))]),
+        np.array([[[0, 3], [1, 1]]], np.uint8),
+        [(jnp.array([0, 3]), np.array([1, 1]))],
+    ],
+)
+def test_any_whole_numbers_in_any_sequence_will_do(trajectories):
+    expected = Demonstrations.from_trajectories([([0, 3], [1, 1])])
+    chex.assert_trees_all_equal(Demonstrations.from_trajectories(trajectories), expected)
+
+
+@pytest.mark.parametrize(
+    ("trajectories", "message"),
+    [
+        ([], "at least one trajectory is needed, got none"),
+        ([([0], [0]), ([], [])], "trajectory 1 is empty"),
+        ([([0], [0]), ([0, 1, 2], [0, 1])], "trajectory 1 has 3 states and 2 actions"),
+        ([([0],)], "trajectory 0 must be a pair (states, actions)"),
+        ([([0], [0], [1.0])], "trajectory 0 must be a pair (states, actions)"),
+        ([3], "trajectory 0 must be a pair (states, actions)"),
+        ([([[0]], [0])], "trajectory 0 states must have shape [H], got (1, 1)"),
+        ([(0, 0)], "trajectory 0 states must have shape [H], got ()"),
+        ([([0, 1], [0, -1])], "trajectory 0 actions[1] must not be negative, got -1"),
+        ([([0, 0.5], [0, 1])], "trajectory 0 states[1] must be whole, got 0.5"),
+        ([([0, np.nan], [0, 1])], "trajectory 0 states[1] must be whole, got nan"),
+        ([([0, 2**31], [0, 1])], "trajectory 0 states[1] must be below 2147483647, got 2147483648"),
+        ([(["left"], [0])], "trajectory 0 states must hold integers, got dtype <U4"),
+    ],
+)
+def test_from_trajectories_refuses(trajectories, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Demonstrations.from_trajectories(trajectories)
+
+
+def test_traced_trajectories_are_refused():
+    def build(states):
+        return Demonstrations.from_trajectories([(states, [0, 0])])
+
+    with pytest.raises(ValueError, match="trajectory 0 states is a traced value"):
+        jax.jit(build)(jnp.array([0, 1]))
+
+
+@pytest.mark.parametrize(
+    ("trajectories", "message"),
+    [
+        ([([0], [0]), ([6, 7], [0, 0])], "states[1, 1] must lie in [0, 7) (index: trajectory, step)"),
+        ([([0, 1], [2, 3])], "actions[0, 1] must lie in [0, 3) (index: trajectory, step), got 3"),
+    ],
+)
+@pytest.mark.parametrize("use", [empirical_policy, monte_carlo_feature_expectations])
+def test_states_and_actions_that_the_model_lacks_are_refused(use, trajectories, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        use(small_models.case("dense").mdp, Demonstrations.from_trajectories(trajectories))
+
+
+def test_fields_of_different_shapes_are_refused():
+    demonstrations = Demonstrations.from_trajectories(RAGGED)
+    broken = demonstrations.replace(actions=demonstrations.actions[:, 1:])
+    with pytest.raises(ValueError, match=r"must have shape \(3, 5\) alike, got \(3, 4\)"):
+        broken.validate(small_models.case("dense").mdp)
+
+
+def test_padding_is_not_validated():
+    demonstrations = Demonstrations.from_trajectories(RAGGED)
+    junk = demonstrations.replace(states=jnp.where(demonstrations.mask, demonstrations.states, 99))
+    junk.validate(small_models.case("dense").mdp)
+
+
+# ------------------------------------------------------- empirical policy, feature expectations
+
+
+@pytest.mark.parametrize("trajectories", [RAGGED, [([3], [0])], [([0, 0], [0, 1])] * 2])
+def test_frequencies_and_expectations_against_plain_loops(trajectories):
+    case = small_models.case("dense")
+    demonstrations = Demonstrations.from_trajectories(trajectories)
+    visited, policy = empirical_policy(case.mdp, demonstrations)
+    expected_visited, expected_policy = oracles.empirical_policy(*case.shape, trajectories)
+    np.testing.assert_array_equal(visited, expected_visited)
+    np.testing.assert_allclose(policy, expected_policy, rtol=1e-15)
+    expected = oracles.monte_carlo_feature_expectations(case.features, case.discount, trajectories)
+    actual = monte_carlo_feature_expectations(case.mdp, demonstrations)
+    np.testing.assert_allclose(actual, expected, rtol=1e-14)
+
+
+def test_demonstrations_of_every_model(case):
+    policy = small_models.random_policy(np.random.default_rng(1), *case.shape)
+    trajectories = oracles.sample_trajectories(
+        np.random.default_rng(2), case.transition, case.initial, policy, 4, 9
+    )
+    demonstrations = Demonstrations.from_trajectories(trajectories)
+    visited, empirical = empirical_policy(case.mdp, demonstrations)
+    expected = oracles.empirical_policy(*case.shape, trajectories)
+    chex.assert_trees_all_close((np.asarray(visited), np.asarray(empirical)), expected, rtol=1e-15)
+    expected = oracles.monte_carlo_feature_expectations(case.features, case.discount, trajectories)
+    actual = monte_carlo_feature_expectations(case.mdp, demonstrations)
+    np.testing.assert_allclose(actual, expected, rtol=1e-13)
+
+
+def test_junk_on_padding_counts_for_nothing():
+    case = small_models.case("dense")
+    clean = Demonstrations.from_trajectories(RAGGED)
+    junk = clean.replace(states=jnp.where(clean.mask, clean.states, 5))
+    for use in (empirical_policy, monte_carlo_feature_expectations):
+        chex.assert_trees_all_equal(use(case.mdp, junk), use(case.mdp, clean))
+
+
+class UnderJitTest(chex.TestCase):
+    """Compiled and not, the results are the same, and a discount can be traced."""
+
+    @chex.variants(with_jit=True, without_jit=True)
+    def test_frequencies_and_expectations(self):
+        case = small_models.case("dense")
+        demonstrations = Demonstrations.from_trajectories(RAGGED)
+        visited, policy = self.variant(empirical_policy)(case.mdp, demonstrations)
+        expected = oracles.empirical_policy(*case.shape, RAGGED)
+        chex.assert_trees_all_close((np.asarray(visited), np.asarray(policy)), expected)
+        actual = self.variant(monte_carlo_feature_expectations)(case.mdp, demonstrations)
+        expected = oracles.monte_carlo_feature_expectations(case.features, case.discount, RAGGED)
+        np.testing.assert_allclose(actual, expected, rtol=1e-14)
+
+
+def test_gradient_of_monte_carlo_in_the_discount():
+    case = small_models.case("dense")
+    demonstrations = Demonstrations.from_trajectories(RAGGED)
+
+    def total(discount):
+        mdp = case.mdp.replace(discount=discount)
+        return monte_carlo_feature_expectations(mdp, demonstrations).sum()
+
+    step = 1e-6
+    low, high = (
+        oracles.monte_carlo_feature_expectations(case.features, case.discount + h, RAGGED).sum()
+        for h in (-step, step)
+    )
+    np.testing.assert_allclose(jax.grad(total)(case.discount), (high - low) / (2 * step), rtol=1e-8)
+
+
+def test_float32_models_give_float32():
+    case = small_models.in_float32(small_models.case("dense"))
+    demonstrations = Demonstrations.from_trajectories(RAGGED)
+    _, policy = empirical_policy(case.mdp, demonstrations)
+    expectations = monte_carlo_feature_expectations(case.mdp, demonstrations)
+    assert policy.dtype == expectations.dtype == jnp.float32
+    expected = oracles.monte_carlo_feature_expectations(case.features, case.discount, RAGGED)
+    np.testing.assert_allclose(expectations, expected, rtol=1e-6)
+
+
+# ---------------------------------------------------------------------------------------- sampling
+
+
+def assert_frequencies(counts, probability, limit=4.5):
+    """Counts [..., N] of draws from `probability` [..., N]: none impossible, none `limit` sigmas off."""
+    assert np.all(counts[probability == 0] == 0)
+    total = counts.sum(axis=-1, keepdims=True)
+    sigma = np.sqrt(total * probability * (1 - probability))
+    assert np.all(np.abs(counts - total * probability) <= limit * sigma + 1e-9)
+
+
+def with_zeros(rng, shape):
+    """Random policy some of whose actions are never taken, the last among them."""
+    policy = small_models.random_policy(rng, *shape)
+    policy[::2, -1] = 0.0
+    policy[1::3, 0] = 0.0
+    return policy / policy.sum(axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("name", ["absorbing", "dense", "sparse"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_sampled_frequencies(name, dtype, rng):
+    """First states, actions and successors, each against its distribution."""
+    case = small_models.case(name)
+    if dtype == np.float32:
+        case = small_models.in_float32(case)
+    policy = with_zeros(rng, case.shape)
+    demonstrations = sample_demonstrations(jax.random.key(3), case.mdp, policy, 20_000, 4)
+    states, actions = np.asarray(demonstrations.states), np.asarray(demonstrations.actions)
+    assert np.all(demonstrations.mask)
+    first = np.bincount(states[:, 0], minlength=case.shape[0])
+    assert_frequencies(first, case.initial)
+    taken = np.zeros(case.shape)
+    np.add.at(taken, (states, actions), 1)
+    assert_frequencies(taken, policy)
+    moved = np.zeros(case.transition.shape)
+    np.add.at(moved, (states[:, :-1], actions[:, :-1], states[:, 1:]), 1)
+    assert_frequencies(moved, case.transition)
+
+
+def test_sampled_expectations_approach_the_exact_ones():
+    """Eq. (6) on long samples, within five standard errors of V(pi)."""
+    case = small_models.case("dense")
+    policy = small_models.random_policy(np.random.default_rng(4), *case.shape)
+    demonstrations = sample_demonstrations(jax.random.key(5), case.mdp, policy, 4000, 120)
+    sample = [
+        monte_carlo_feature_expectations(case.mdp, jax.tree.map(lambda x: x[i::20], demonstrations))
+        for i in range(20)
+    ]
+    error = np.std(sample, axis=0, ddof=1) / np.sqrt(20)
+    expected = oracles.feature_expectations(*case.arrays, policy)
+    assert np.all(np.abs(np.mean(sample, axis=0) - expected) <= 5 * error)
+
+
+def test_the_key_decides():
+    case = small_models.case("dense")
+    policy = small_models.random_policy(np.random.default_rng(6), *case.shape)
+    draw = [sample_demonstrations(jax.random.key(k), case.mdp, policy, 8, 6) for k in (0, 0, 1)]
+    chex.assert_trees_all_equal(draw[0], draw[1])
+    assert np.any(draw[0].states != draw[2].states)
+    chex.assert_shape([draw[0].states, draw[0].actions, draw[0].mask], (8, 6))
+
+
+def test_sampling_under_jit_and_vmap_agrees_key_by_key():
+    case = small_models.case("dense")
+    policy = small_models.random_policy(np.random.default_rng(6), *case.shape)
+    keys = jax.random.split(jax.random.key(0), 3)
+
+    def draw(key):
+        return sample_demonstrations(key, case.mdp, policy, 8, 6)
+
+    lanes = jax.jit(jax.vmap(draw))(keys)
+    for i, key in enumerate(keys):
+        chex.assert_trees_all_equal(jax.tree.map(lambda x: x[i], lanes), draw(key))  # noqa: B023
+
+
+def test_one_state_and_one_step():
+    mdp = MDP.from_dense(np.ones((1, 1, 1)), discount=0.5, features=np.ones((1, 1)))
+    demonstrations = sample_demonstrations(jax.random.key(0), mdp, np.ones((1, 1)), 1, 1)
+    assert not np.any(demonstrations.states) and not np.any(demonstrations.actions)
+    np.testing.assert_array_equal(monte_carlo_feature_expectations(mdp, demonstrations), [1.0])
+
+
+@pytest.mark.parametrize(
+    ("policy_shape", "num_trajectories", "horizon", "message"),
+    [
+        ((7, 2), 1, 1, r"policy must have shape \(7, 3\) or \(B, 7, 3\), got \(7, 2\)"),
+        ((2, 7, 3), 1, 1, r"policy must have shape \[S, A\], not a batch, got \(2, 7, 3\)"),
+        ((7, 3), 0, 1, "num_trajectories and horizon must be at least 1, got 0 and 1"),
+        ((7, 3), 1, 0, "num_trajectories and horizon must be at least 1, got 1 and 0"),
+    ],
+)
+def test_sampling_refuses(policy_shape, num_trajectories, horizon, message):
+    mdp = small_models.case("dense").mdp
+    with pytest.raises(ValueError, match=message):
+        sample_demonstrations(
+            jax.random.key(0), mdp, np.ones(policy_shape) / 3, num_trajectories, horizon
+        )

@@ -1,0 +1,284 @@
+"""Optimal plans against policy iteration in NumPy; residuals and bounds against their definitions."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import small_models
+
+from jaxhom.domains import gridworld
+from jaxhom.mdp import MDP
+from jaxhom.planning import Plan, greedy_policy, optimal_policy
+
+
+@functools.cache
+def reward_of(name):
+    """One reward per model, of both signs."""
+    case = small_models.case(name)
+    return np.random.default_rng(20).normal(size=case.shape)
+
+
+@functools.cache
+def optimum(name):
+    """Optimal value and action value by the oracle."""
+    case = small_models.case(name)
+    return oracles.optimal_value(case.transition, case.discount, reward_of(name))
+
+
+def bellman_residual(case, reward, value):
+    """max_s |max_a r + gamma T V - V|, by NumPy."""
+    action_value = reward + case.discount * case.transition @ value
+    return np.abs(action_value.max(axis=1) - value).max()
+
+
+def first_best(action_value, slack):
+    """The lowest action within `slack` of the best."""
+    return np.argmax(action_value >= action_value.max(axis=1, keepdims=True) - slack, axis=1)
+
+
+# -------------------------------------------------------------------------------------- the numbers
+
+
+def test_against_policy_iteration(case):
+    reward = reward_of(case.name)
+    value, action_value = optimum(case.name)
+    plan = optimal_policy(case.mdp, reward)
+    chex.assert_shape([plan.policy, plan.action_value], case.shape)
+    chex.assert_shape([plan.iterations, plan.residual], ())
+    bound = float(plan.residual) / (1 - case.discount)
+    assert plan.residual <= 1e-10 * np.abs(reward).max()
+    np.testing.assert_allclose(plan.value, value, rtol=0, atol=1.01 * bound + 1e-12)
+    np.testing.assert_allclose(plan.action_value, action_value, rtol=0, atol=1.01 * bound + 1e-12)
+    np.testing.assert_array_equal(plan.policy.argmax(axis=1), first_best(action_value, 1e-8))
+    np.testing.assert_array_equal(np.sort(plan.policy, axis=1)[:, -1], 1)
+    np.testing.assert_array_equal(plan.policy.sum(axis=1), 1)
+
+
+def test_the_policy_is_worth_what_the_plan_says(case):
+    reward = reward_of(case.name)
+    plan = optimal_policy(case.mdp, reward)
+    achieved = oracles.policy_value(
+        case.transition, case.discount, np.asarray(plan.policy), reward
+    )
+    np.testing.assert_allclose(achieved, optimum(case.name)[0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("tolerance", [3.0, 1e-2, 1e-5, 0.0])
+@pytest.mark.parametrize("name", ["dense", "absorbing", "restart"])
+def test_residual_and_bounds_hold_at_every_tolerance(name, tolerance):
+    case, reward = small_models.case(name), reward_of(name)
+    plan = optimal_policy(case.mdp, reward, tolerance=tolerance)
+    value = np.asarray(plan.value)
+    scale = np.abs(plan.action_value).max()
+    assert plan.residual <= max(tolerance, 1e-14 * scale)
+    true_residual = bellman_residual(case, reward, value)
+    np.testing.assert_allclose(plan.residual, true_residual, rtol=1e-9, atol=1e-14 * scale)
+    action_value = reward + case.discount * case.transition @ value
+    np.testing.assert_allclose(plan.action_value, action_value, rtol=0, atol=1e-14 * scale)
+    error = np.abs(value - optimum(name)[0]).max()
+    assert error <= plan.residual / (1 - case.discount) + 1e-12 * scale
+    assert np.all(plan.upper_bound(case.mdp) >= optimum(name)[0] - 1e-13 * scale)
+    achieved = oracles.policy_value(
+        case.transition, case.discount, np.asarray(plan.policy), reward
+    )
+    loss = (optimum(name)[0] - achieved).max()
+    # twice the residual for the value, four times for actions that tie
+    assert loss <= 6 * plan.residual / (1 - case.discount) + 1e-9
+
+
+@pytest.mark.parametrize("max_iterations", [0, 1, 5])
+def test_a_plan_that_is_cut_short_says_so_and_its_bound_holds(max_iterations):
+    case, reward = small_models.case("restart"), reward_of("restart")
+    plan = optimal_policy(case.mdp, reward, max_iterations=max_iterations)
+    assert plan.iterations == max_iterations
+    assert plan.residual > 1e-3
+    residual = bellman_residual(case, reward, np.asarray(plan.value))
+    np.testing.assert_allclose(plan.residual, residual, rtol=1e-12)
+    assert np.all(plan.upper_bound(case.mdp) >= optimum("restart")[0])
+
+
+@pytest.mark.parametrize("discount", [0.01, 0.999])
+def test_extreme_discounts(discount):
+    case = small_models.case("restart")._replace(discount=discount)
+    reward = reward_of("restart")
+    plan = optimal_policy(case.mdp.replace(discount=jnp.asarray(discount)), reward)
+    value, action_value = oracles.optimal_value(case.transition, discount, reward)
+    np.testing.assert_allclose(plan.value, value, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(plan.policy.argmax(axis=1), first_best(action_value, 1e-8))
+
+
+def test_a_model_that_never_mixes():
+    """Two absorbing states of different worth: the span of the error shrinks by the discount alone."""
+    case = small_models.case("absorbing")
+    reward = np.array([[0, 0], [0, 0], [1, 1], [0, 0], [-1, -1], [-1, -1]])
+    plan = optimal_policy(case.mdp, reward)
+    g = case.discount
+    expected = np.array([g**2, g, 1, g**3, -1, -1]) / (1 - g)
+    expected[3] = max(g**3, -g) / (1 - g)
+    np.testing.assert_allclose(plan.value, expected, rtol=0, atol=1e-9)
+
+
+def test_zero_reward_gives_zero_and_the_first_action(case):
+    plan = optimal_policy(case.mdp, np.zeros(case.shape))
+    np.testing.assert_array_equal(plan.value, 0)
+    np.testing.assert_array_equal(plan.policy, np.eye(case.shape[1])[np.zeros(case.shape[0], int)])
+    assert plan.iterations <= 1 and plan.residual == 0
+
+
+# ---------------------------------------------------------------------------------- ties, float32
+
+
+def test_equal_actions_go_to_the_lowest():
+    """Actions 1 and 3 are copies, and better than 0 and 2."""
+    case = small_models.case("dense")
+    transition = case.transition[:, [0, 1, 0, 1]]
+    mdp = MDP.from_dense(transition, discount=case.discount)
+    plan = optimal_policy(mdp, np.tile([0.0, 10.0, 0.0, 10.0], (7, 1)))
+    np.testing.assert_array_equal(plan.policy, np.eye(4)[np.ones(7, int)])
+
+
+def test_ties_of_a_gridworld_are_not_left_to_rounding():
+    """To the far corner right and down are equally good in the interior: down is the lower action."""
+    world = gridworld(6, discount=0.99)
+    reward = np.zeros(36)
+    reward[-1] = 1.0
+    _, action_value = oracles.optimal_value(
+        oracles.gridworld_transition(6), 0.99, np.repeat(reward[:, None], 4, axis=1)
+    )
+    actions = np.asarray(optimal_policy(world.mdp, reward).policy.argmax(axis=1))
+    np.testing.assert_array_equal(actions, first_best(action_value, 1e-9))
+    rows, columns = np.divmod(np.arange(36), 6)
+    np.testing.assert_array_equal(actions[rows == columns][:-1], 1)
+
+
+@pytest.mark.parametrize(
+    ("slack", "expected"), [(0.0, [2, 0]), (0.1, [1, 0]), (5.0, [0, 0])]
+)
+def test_greedy_policy(slack, expected):
+    action_value = np.array([[0.0, 0.95, 1.0], [2.0, 2.0, 2.0]])
+    np.testing.assert_array_equal(greedy_policy(action_value, slack), np.eye(3)[expected])
+    batch = np.stack([action_value, action_value + 7])
+    np.testing.assert_array_equal(greedy_policy(batch, slack)[1], np.eye(3)[expected])
+
+
+@pytest.mark.parametrize("name", ["one_state", "dense", "restart"])
+@pytest.mark.parametrize("discount", [0.9, 0.999])
+def test_float32_stops_by_itself_and_its_bound_holds(name, discount):
+    """Against the optimum of the rounded model, in float64."""
+    case = small_models.in_float32(small_models.case(name)._replace(discount=discount))
+    rewards = np.random.default_rng(21).uniform(size=(8, *case.shape)).astype(np.float32)
+    plans = optimal_policy(case.mdp, rewards)
+    assert plans.value.dtype == plans.residual.dtype == jnp.float32
+    assert np.all(plans.iterations < 2000)
+    upper = np.asarray(plans.upper_bound(case.mdp), np.float64)
+    for lane, reward in enumerate(rewards.astype(float)):
+        value, _ = oracles.optimal_value(case.transition, case.discount, reward)
+        assert np.all(upper[lane] >= value)
+        slack = np.abs(plans.value[lane] - value).max()
+        assert slack <= 1e-5 * np.abs(value).max() / (1 - case.discount)
+
+
+def test_float64_bound_holds_where_the_residual_rounds_to_zero(rng):
+    mdp = small_models.case("one_state").mdp
+    rewards = rng.uniform(size=(50, 1, 1))
+    plans = optimal_policy(mdp, rewards)
+    # by hand, in extended precision: one state, one action
+    exact = rewards[:, :, 0].astype(np.longdouble) / (1 - np.longdouble(float(mdp.discount)))
+    assert np.all(np.asarray(plans.upper_bound(mdp)) >= exact)
+
+
+# ------------------------------------------------------------------ shapes, batches, jit and vmap
+
+
+@pytest.mark.parametrize("name", ["dense", "restart"])
+def test_batches_agree_with_single_rewards_lane_by_lane(name):
+    case, reward = small_models.case(name), reward_of(name)
+    rewards = np.stack([reward, np.zeros_like(reward), -3 * reward])
+    batched = optimal_policy(case.mdp, rewards)
+    chex.assert_shape(batched.value, (3, case.shape[0]))
+    chex.assert_shape([batched.iterations, batched.residual], (3,))
+    singles = [optimal_policy(case.mdp, r) for r in rewards]
+    stacked = jax.tree.map(lambda *lanes: jnp.stack(lanes), *singles)
+    np.testing.assert_array_equal(batched.iterations, stacked.iterations)
+    chex.assert_trees_all_close(batched, stacked, rtol=1e-12, atol=1e-12)
+    chex.assert_trees_all_close(
+        batched.upper_bound(case.mdp), stacked.upper_bound(case.mdp), rtol=1e-12
+    )
+
+
+def test_state_rewards_hold_for_every_action():
+    case = small_models.case("dense")
+    rewards = np.random.default_rng(22).normal(size=(2, 7))
+    spread = np.repeat(rewards[..., None], 3, axis=2)
+    for state_reward, reward in ((rewards, spread), (rewards[0], spread[0])):
+        chex.assert_trees_all_equal(
+            optimal_policy(case.mdp, state_reward), optimal_policy(case.mdp, reward)
+        )
+
+
+def test_a_square_reward_is_one_reward():
+    mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.5)
+    plan = optimal_policy(mdp, np.array([[0.0, 1.0], [2.0, 0.0]]))
+    np.testing.assert_array_equal(plan.policy, [[0, 1], [1, 0]])
+
+
+def test_a_former_value_saves_the_sweeps():
+    case, reward = small_models.case("restart"), reward_of("restart")
+    cold = optimal_policy(case.mdp, reward)
+    assert cold.iterations > 20
+    warm = optimal_policy(case.mdp, reward, initial_value=cold.value)
+    assert warm.iterations <= 2
+    rewards = np.stack([reward, reward])
+    for start in (cold.value, jnp.stack([cold.value, cold.value + 1])):
+        lanes = optimal_policy(case.mdp, rewards, initial_value=start)
+        assert np.all(lanes.iterations <= 2)
+        np.testing.assert_allclose(lanes.value[1], cold.value, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["dense", "restart"])
+def test_vmapped_discounts_and_jit(name):
+    case, reward = small_models.case(name), reward_of(name)
+    discounts = np.array([0.5, 0.9])
+
+    @jax.jit
+    @jax.vmap
+    def plan_and_bound(discount) -> tuple[Plan, jax.Array]:
+        mdp = case.mdp.replace(discount=discount)
+        plan = optimal_policy(mdp, reward)
+        return plan, plan.upper_bound(mdp)
+
+    plans, bounds = plan_and_bound(discounts)
+    for i, discount in enumerate(discounts):
+        value, _ = oracles.optimal_value(case.transition, discount, reward)
+        np.testing.assert_allclose(plans.value[i], value, rtol=0, atol=1e-8)
+        assert np.all(bounds[i] >= value - 1e-12)
+
+
+def test_one_trace_serves_all_rewards_of_one_shape():
+    chex.clear_trace_counter()
+    case = small_models.case("dense")
+    plan = jax.jit(chex.assert_max_traces(optimal_policy, n=1))
+    for scale in (1.0, 2.0):
+        plan(case.mdp, scale * reward_of("dense"))
+
+
+# ---------------------------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (6, 3), (7, 2), (2, 7, 2), (2, 6, 3), (1, 2, 7, 3)])
+def test_rewards_of_another_shape_are_refused(shape):
+    message = r"reward must have shape \(7, 3\), \(7,\), \(B, 7, 3\) or \(B, 7\), got"
+    with pytest.raises(ValueError, match=message):
+        optimal_policy(small_models.case("dense").mdp, np.zeros(shape))
+
+
+@pytest.mark.parametrize("shape", [(6,), (7, 1), (3, 7), (1, 2, 7)])
+def test_initial_values_of_another_shape_are_refused(shape):
+    with pytest.raises(ValueError, match=r"initial_value must have shape \(\.\.\., 7\), got"):
+        optimal_policy(
+            small_models.case("dense").mdp, np.zeros((2, 7)), initial_value=np.zeros(shape)
+        )

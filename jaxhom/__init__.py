@@ -1,0 +1,69 @@
+"""jaxhom: apprenticeship learning when demonstrations cover only a small part of a large state space.
+
+From a few expert trajectories in a finite MDP without a reward to a policy for every state: the expert's actions are
+carried over to states whose local model is softly homomorphic to a demonstrated one (Boularias and Chaib-draa 2010),
+feature expectations come from linear solves, and LPAL turns them into a policy with a certified margin.
+
+Importing the library changes no JAX setting. For float64, set `jax_enable_x64` before making models.
+"""
+
+from jaxhom.demonstrations import (
+    Demonstrations,
+    empirical_policy,
+    monte_carlo_feature_expectations,
+    sample_demonstrations,
+)
+from jaxhom.domains import Gridworld, Racetrack, gridworld, racetrack, sample_weights
+from jaxhom.evaluation import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
+from jaxhom.generalization import (
+    Generalization,
+    maximum_entropy,
+    nearest_neighbors,
+    soft_local_homomorphism,
+)
+from jaxhom.homomorphism import (
+    LocalSimilarity,
+    homomorphism_error,
+    local_similarity,
+    locally_similar,
+)
+from jaxhom.lpal import LPALSolution, lpal
+from jaxhom.mdp import MDP
+from jaxhom.occupancy import feature_expectations, occupancy, policy_value
+from jaxhom.pdhg import Status
+from jaxhom.planning import Plan, optimal_policy
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "MDP",
+    "Demonstrations",
+    "Evaluation",
+    "Generalization",
+    "Gridworld",
+    "LPALSolution",
+    "LocalSimilarity",
+    "Plan",
+    "Racetrack",
+    "Status",
+    "agreement",
+    "empirical_policy",
+    "evaluate_by_sampling",
+    "evaluate_exactly",
+    "feature_expectations",
+    "gridworld",
+    "homomorphism_error",
+    "local_similarity",
+    "locally_similar",
+    "lpal",
+    "maximum_entropy",
+    "monte_carlo_feature_expectations",
+    "nearest_neighbors",
+    "occupancy",
+    "optimal_policy",
+    "policy_value",
+    "racetrack",
+    "sample_demonstrations",
+    "sample_weights",
+    "soft_local_homomorphism",
+]

@@ -1,0 +1,149 @@
+"""Models, demonstrations and policies as `.npz` files: NumPy archives of plain arrays, no pickles.
+
+    model           discount          scalar in (0, 1)
+                    transition        [S, A, S], rows sum to 1                        one of
+                    next_state        integers [S, A, N] and                          these
+                    probability       [S, A, N], rows sum to 1                        two
+                    initial           [S], optional: uniform if missing
+                    features          [S, A, K] or [S, K], optional
+    demonstrations  states, actions   integers [M, H] (or [H] for one trajectory)
+                    length            integers [M], optional: steps of each trajectory; H if missing
+    policy          policy            [S, A], rows sum to 1
+                    and whatever else its maker put there
+
+Anything that `numpy.savez` wrote with these names is read. What is read goes through the same checks as fresh input;
+whatever is wrong is one `FileError` that names the file and the array.
+"""
+
+import os
+import zipfile
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.demonstrations import Demonstrations
+from jaxhom.mdp import MDP
+
+FORMAT_VERSION = 1
+
+
+class FileError(ValueError):
+    """A file that cannot be read as what it should be; the message is one line that names it."""
+
+
+def load_mdp(path: str | os.PathLike) -> MDP:
+    """Reads a model (see the module's table), in the dtype of its probabilities.
+
+    Raises:
+      FileError: if the file is missing, truncated, of another kind, or holds invalid values.
+    """
+    arrays = _read(path)
+    options = {name: arrays[name] for name in ("initial", "features") if name in arrays}
+    _require(path, arrays, "discount")
+    try:
+        if "transition" in arrays:
+            return MDP.from_dense(arrays["transition"], discount=arrays["discount"], **options)
+        if "next_state" not in arrays and "probability" not in arrays:
+            raise ValueError("neither transition nor next_state and probability are in it")
+        _require(path, arrays, "next_state", "probability")
+        return MDP.from_successors(
+            arrays["next_state"], arrays["probability"], discount=arrays["discount"], **options
+        )
+    except FileError:
+        raise
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from None
+
+
+def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
+    """Reads demonstrations (see the module's table).
+
+    Raises:
+      FileError: as `load_mdp`.
+    """
+    arrays = _read(path)
+    _require(path, arrays, "states", "actions")
+    try:
+        states, actions = np.atleast_2d(arrays["states"]), np.atleast_2d(arrays["actions"])
+        checks.require_shape("states", states, "[M, H]", states.ndim == 2)
+        checks.require_shape("actions", actions, str(states.shape), actions.shape == states.shape)
+        count, horizon = states.shape
+        length = arrays.get("length", np.full(count, horizon))
+        checks.require_shape("length", length, f"({count},)", length.shape == (count,))
+        length = checks.require_integers("length", length, upper=horizon + 1)
+        rows = zip(states, actions, length, strict=True)
+        return Demonstrations.from_trajectories([(s[:n], a[:n]) for s, a, n in rows])
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from None
+
+
+def load_policy(path: str | os.PathLike) -> np.ndarray:
+    """Reads a policy [S, A].
+
+    Raises:
+      FileError: as `load_mdp`.
+    """
+    arrays = _read(path)
+    _require(path, arrays, "policy")
+    try:
+        policy = arrays["policy"]
+        checks.require_shape("policy", policy, "[S, A]", policy.ndim == 2)
+        return checks.require_distribution("policy", policy)
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from None
+
+
+def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
+    """Writes a model, in the successor layout."""
+    names = ("next_state", "probability", "initial", "features", "discount")
+    _write(path, {name: getattr(mdp, name) for name in names})
+
+
+def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations) -> None:
+    """Writes demonstrations."""
+    length = np.asarray(demonstrations.mask).sum(axis=1)
+    arrays = {"states": demonstrations.states, "actions": demonstrations.actions, "length": length}
+    _write(path, arrays)
+
+
+def save_policy(path: str | os.PathLike, policy, **extras) -> None:
+    """Writes a policy [S, A] and any further arrays by name."""
+    _write(path, {"policy": policy, **extras})
+
+
+def _write(path: str | os.PathLike, arrays: Mapping[str, object]) -> None:
+    """Writes to a file beside `path` first, so that an interrupted write leaves no half of a file there."""
+    path = os.fspath(path)
+    partial = f"{path}.partial"
+    with open(partial, "wb") as file:
+        arrays = {name: np.asarray(array) for name, array in arrays.items()}
+        np.savez_compressed(file, format_version=FORMAT_VERSION, **arrays)
+    os.replace(partial, path)
+
+
+def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All arrays of an archive."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise FileError(f"{path}: one array, not an .npz archive of named arrays")
+            arrays = {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise FileError(f"{path}: no such file") from None
+    except FileError:
+        raise
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise FileError(f"{path}: not a readable .npz archive ({reason})") from None
+    version = arrays.pop("format_version", np.asarray(FORMAT_VERSION))
+    if version.shape != () or int(version) > FORMAT_VERSION:
+        raise FileError(f"{path}: written in format {version}, this release reads up to {FORMAT_VERSION}")
+    return arrays
+
+
+def _require(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
+    for name in names:
+        if name not in arrays:
+            present = ", ".join(sorted(arrays)) or "nothing"
+            raise FileError(f"{path}: array {name!r} is missing (it holds {present})")

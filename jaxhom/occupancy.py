@@ -228,8 +228,10 @@ def _bicgstab(system: Callable, b: jax.Array) -> jax.Array:
             count + 1,
         )
 
-    shadow = b
-    start = (jnp.zeros_like(b), b, b, dot(b, b), jnp.zeros((), jnp.int32))
+    # Any fixed dense vector will do. Not b: from a single start state it would see nothing of what moves on.
+    shadow = 1.0 + jnp.sin(jnp.arange(len(b), dtype=b.dtype) ** 2)
+    shadow = jnp.broadcast_to(shadow.reshape(-1, *(1,) * (b.ndim - 1)), b.shape)
+    start = (jnp.zeros_like(b), b, b, dot(shadow, b), jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(keep_going, step, start)[0]
 
 

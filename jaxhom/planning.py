@@ -82,7 +82,7 @@ def optimal_policy(
     if initial_value is None:
         initial_value = jnp.zeros((reward.shape[0], mdp.num_states), mdp.dtype)
     initial_value = jnp.asarray(initial_value, mdp.dtype)
-    if initial_value.ndim == 1:
+    if initial_value.shape == (mdp.num_states,):
         initial_value = jnp.broadcast_to(initial_value, (reward.shape[0], mdp.num_states))
     good = initial_value.shape == (reward.shape[0], mdp.num_states)
     checks.require_shape("initial_value", initial_value, f"(..., {mdp.num_states})", good)

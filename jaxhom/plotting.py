@@ -14,6 +14,7 @@ This module needs matplotlib (`pip install 'jaxhom[plot]'`); `import jaxhom` doe
 """
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 
 import jax
@@ -33,7 +34,8 @@ try:
     from matplotlib.axes import Axes
     from matplotlib.collections import EllipseCollection, LineCollection, PatchCollection
     from matplotlib.figure import Figure
-    from matplotlib.patches import Rectangle
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch, Rectangle
     from matplotlib.ticker import MaxNLocator
 except ImportError as error:
     raise ImportError(
@@ -49,10 +51,13 @@ AMOUNT = colors.LinearSegmentedColormap.from_list(
 """Colours of amounts, white to blue, light enough everywhere for black on top."""
 
 _INK, _WALL, _ROAD, _FAINT = "#222222", "#C9C9C9", "#FFFFFF", "#BBBBBB"
+_START, _TINT = "#9AD9C3", "#F6EC86"
 _CHECKER = 4  # chequers along the side of a finish cell
 _LEAST_PROBABILITY = 0.02  # of an action that gets an arrow
 _DECADES = 4  # of an occupancy that are told apart
 _SPREAD = 0.4  # width of the lane, in cells, that several trajectories share
+_BAR_ROOM = 0.9  # inches beside the map
+_STRIP_WIDTH = 5.2  # inches
 _NUM_TRIALS = 99  # of which the figure shows the median one
 
 
@@ -86,7 +91,7 @@ def plot_gridworld(
     board = _board(gridworld, Gridworld)
     if values is not None:
         values = _require("values", values, (board.num_states,))
-    ax = _ground(board, ax)
+    ax = _ground(board, ax, _BAR_ROOM * (values is not None))
     if values is not None:
         _heat(ax, board, values, label)
     return _overlay(board, ax, visited, policy, trajectories)
@@ -112,7 +117,7 @@ def plot_racetrack(
       policy: [S, A], as arrows, for cars of one speed; see `plot_policy`.
       speed: (row, column) speed of these cars, each in -2 ... 2.
       trajectories: drawn by `plot_trajectories`.
-      visited: bool [S]; a cell with a visited state is tinted.
+      visited: bool [S]; an open cell with a visited state is tinted.
       label: what `values` are, for the colour bar.
       ax: axes to draw on; new ones if None.
 
@@ -126,7 +131,7 @@ def plot_racetrack(
     if values is not None:
         values = _require("values", values, (board.num_cells,), (board.num_states,))
         values = values.reshape(board.num_cells, -1).max(axis=1)
-    ax = _ground(board, ax)
+    ax = _ground(board, ax, _BAR_ROOM * (values is not None))
     if values is not None:
         _heat(ax, board, values, label)
     return _overlay(board, ax, visited, policy, trajectories, speed)
@@ -192,9 +197,10 @@ def plot_trajectories(
     label: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draws trajectories as lines with a dot per step and a ring where each begins.
+    """Draws trajectories as lines with a dot per step and a ring in every cell where one begins.
 
-    Several trajectories run side by side, each with its own offset from the centres of the cells.
+    Several trajectories run side by side: from its ring on, each has an offset of its own from the
+    centres of the cells.
     On a racetrack a line is cut where the car is put back from the finish to the start.
 
     Args:
@@ -215,16 +221,17 @@ def plot_trajectories(
     ax = _ground(board, ax) if ax is None else ax
     num = trajectories.num_trajectories
     offset = _SPREAD * (np.arange(num) - (num - 1) / 2) / max(num - 1, 1)
-    style = {"color": color, "linewidth": 1.4, "marker": "o", "markersize": 2.8, "alpha": 0.9}
-    starts = []
-    for m, states in enumerate(_unpadded(trajectories)):
-        path = board.cells[states // board.per_cell] + offset[m]
-        ends = np.flatnonzero(~board.is_open[states // board.per_cell])[:-1] + 1
-        y, x = np.insert(path, ends, np.nan, axis=0).T
-        ax.plot(x, y, label=None if m else label, zorder=5, **style)
-        starts.append(path[0])
-    y, x = np.array(starts).T
-    ax.scatter(x, y, s=34, facecolor="white", edgecolor=color, linewidth=1.4, zorder=6)
+    width = 1.6 if num == 1 else 1.0
+    style = {"color": color, "linewidth": width, "marker": "o", "markersize": 1.0 + 1.6 * width}
+    paths = [states // board.per_cell for states in _unpadded(trajectories)]
+    for m, path in enumerate(paths):
+        ends = np.flatnonzero(~board.is_open[path]) + 1
+        points = board.cells[path] + offset[m]
+        points[0] = board.cells[path[0]]
+        y, x = np.insert(points, ends, np.nan, axis=0).T
+        ax.plot(x, y, label=None if m else label, alpha=0.9, zorder=3, **style)
+    y, x = board.cells[np.unique([path[0] for path in paths])].T
+    ax.scatter(x, y, s=50, facecolor="white", edgecolor=color, linewidth=1.6, zorder=3.5)
     return ax
 
 
@@ -260,7 +267,7 @@ def plot_occupancy(
         raise ValueError(f"occupancy must be positive in some open cell, its largest is {largest}")
     least = largest / 10**_DECADES
     scale = colors.LogNorm(vmin=least, vmax=largest)
-    ax = _ground(board, ax)
+    ax = _ground(board, ax, _BAR_ROOM)
     _heat(ax, board, np.where(visits < least, np.nan, visits), label, norm=scale)
     return ax
 
@@ -291,11 +298,13 @@ def plot_radius(domain: Gridworld | Racetrack, radius, *, ax: Axes | None = None
     levels = plt.get_cmap("cividis_r")(np.linspace(0.0, 1.0, largest))
     palette = colors.ListedColormap([colors.to_rgba(PURPLE), colors.to_rgba(VERMILLION), *levels])
     scale = colors.BoundaryNorm(np.arange(-1, largest + 2) - 0.5, palette.N)
-    ax = _ground(board, ax)
+    ax = _ground(board, ax, 1.6 * _BAR_ROOM)
     image = _show(ax, board, radius, cmap=palette, norm=scale)
-    bar = _colorbar(ax, board, image, "radius at which advice was found")
+    bar = _colorbar(ax, board, image, "")
     shown = np.arange(1, largest + 1, -(-largest // 8))
-    bar.set_ticks([-1, 0, *shown], labels=["none", "demonstrated", *map(str, shown)])
+    names = ["nothing found", "demonstrated", f"{shown[0]} step away", *map(str, shown[1:])]
+    bar.set_ticks([-1, 0, *shown], labels=names)
+    bar.minorticks_off()
     bar.ax.tick_params(length=0)
     if board.per_cell > 1:
         borders = _borders(board, np.arange(board.num_cells))
@@ -361,7 +370,8 @@ def learned_policy_figure(
     Left the gridworld: its true reward, the demonstrations, the learned policy. Right the racetrack
     once per policy, with the demonstrated cells tinted and a trial of the policy, up to the finish.
     Of 99 trials the one with the median total reward is drawn; all policies meet the same random
-    numbers. A cross marks an off-road (where staying in the cell can have had no other cause).
+    numbers. Crosses mark the steps that were off-roads more likely than not, and the title counts
+    how many there were in expectation, given where the car was at every step.
 
     Args:
       gridworld: the domain on the left.
@@ -384,22 +394,21 @@ def learned_policy_figure(
     if not racetrack_policies:
         raise ValueError("racetrack_policies must name at least one policy")
     num = len(racetrack_policies)
-    figure = plt.figure(figsize=(13.0, max(6.0, 2.1 * num)), layout="constrained")
-    grid = figure.add_gridspec(num, 2, width_ratios=[1.0, 1.1])
-    _draw_learned_gridworld(
-        figure.add_subplot(grid[:, 0]),
-        gridworld,
-        reward,
-        gridworld_demonstrations,
-        gridworld_policy,
-    )
+    rows, columns = _board(racetrack, Racetrack).shape
+    strip = min(_STRIP_WIDTH * rows / columns, 2.5)
+    height = max(5.5, 0.45 + num * (strip + 0.35))
+    widths = height + 0.5, _STRIP_WIDTH + 0.1
+    figure = plt.figure(figsize=(sum(widths), height), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=widths)
+    _draw_learned_gridworld(left, gridworld, reward, gridworld_demonstrations, gridworld_policy)
     visited, _ = empirical_policy(racetrack.mdp, racetrack_demonstrations)
-    palette = (BLACK, ORANGE, BLUE, GREEN, PURPLE, SKY)
-    for i, (name, policy) in enumerate(racetrack_policies.items()):
-        ax = plot_racetrack(racetrack, visited=visited, ax=figure.add_subplot(grid[i, 1]))
-        trial = _median_trial(key, racetrack, policy, horizon)
-        _draw_trial(ax, racetrack, trial, name, palette[i % len(palette)])
-        ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
+    palette = itertools.cycle((BLACK, VERMILLION, BLUE, PURPLE, GREEN, ORANGE))
+    axes = right.subplots(num, squeeze=False)[:, 0]
+    for ax, color, (name, policy) in zip(axes, palette, racetrack_policies.items(), strict=False):
+        plot_racetrack(racetrack, visited=visited, ax=ax)
+        _draw_trial(ax, racetrack, _median_trial(key, racetrack, policy, horizon), name, color)
+    demonstrated = Patch(color=_TINT, label="demonstrated")
+    _legend(right, demonstrated, _marker("o-", "steps of a trial"), _marker("X", "off-road"))
     return figure
 
 
@@ -475,12 +484,15 @@ def _require(name: str, array, *shapes: tuple[int, ...]) -> np.ndarray:
     return checks.require_floats(name, array)
 
 
-def _ground(board: _Board, ax: Axes | None) -> Axes:
-    """Draws the empty domain: the regions of a gridworld; walls, start and finish of a track."""
+def _ground(board: _Board, ax: Axes | None, room: float = 0.0) -> Axes:
+    """Draws the empty domain: the regions of a gridworld; walls, start and finish of a track.
+
+    New axes get `room` inches to their right, for a colour bar.
+    """
     rows, columns = board.shape
     if ax is None:
-        scale = min(10.0 / columns, 6.0 / rows, 0.6)
-        size = (columns * scale + 1.8, rows * scale + 0.8)
+        scale = min(9.0 / columns, 5.5 / rows, 0.6)
+        size = (columns * scale + 0.8 + room, rows * scale + 0.8)
         _, ax = plt.subplots(figsize=size, layout="constrained")
     if isinstance(board.domain, Gridworld):
         borders = _borders(board, np.asarray(board.domain.region))
@@ -489,7 +501,7 @@ def _ground(board: _Board, ax: Axes | None) -> Axes:
         ax.set_facecolor(_WALL)
         ax.imshow(_track_image(board.domain.rows), extent=_extent(board), zorder=0)
         borders = _borders(board, np.ones(board.num_cells, int))
-        color, width, margin = _INK, 1.2, 1.0
+        color, width, margin = _INK, 1.2, 0.9
         ax.spines[:].set_visible(False)
     ax.add_collection(LineCollection(borders, colors=color, linewidths=width, zorder=2))
     ax.set(xlim=(-margin, columns - 1 + margin), ylim=(rows - 1 + margin, -margin), aspect="equal")
@@ -501,7 +513,7 @@ def _ground(board: _Board, ax: Axes | None) -> Axes:
 
 def _track_image(rows: tuple[str, ...]) -> np.ndarray:
     """RGB image of a track's cells, `_CHECKER` pixels along the side of each."""
-    tone = {"#": _WALL, ".": _ROAD, "S": "#9AD9C3", "F": _ROAD}
+    tone = {"#": _WALL, ".": _ROAD, "S": _START, "F": _ROAD}
     letters = np.array([list(row) for row in rows])
     image = np.array([[colors.to_rgb(tone[letter]) for letter in row] for row in letters])
     image = image.repeat(_CHECKER, axis=0).repeat(_CHECKER, axis=1)
@@ -554,13 +566,13 @@ def _overlay(board: _Board, ax: Axes, visited, policy, trajectories, speed=(0, 0
     """Draws on a domain what is given."""
     if visited is not None:
         visited = _require("visited", visited, (board.num_states,)) > 0
-        cells = board.cells[visited.reshape(board.num_cells, -1).any(axis=1)]
-        tint = [Rectangle((x - 0.5, y - 0.5), 1.0, 1.0) for y, x in cells]
-        ax.add_collection(PatchCollection(tint, facecolor=YELLOW, alpha=0.55, zorder=1.5))
-    if policy is not None:
-        plot_policy(board.domain, policy, speed=speed, ax=ax)
+        cells = board.cells[visited.reshape(board.num_cells, -1).any(axis=1) & board.is_open]
+        tint = [Rectangle((x - 0.4, y - 0.4), 0.8, 0.8) for y, x in cells]
+        ax.add_collection(PatchCollection(tint, facecolor=_TINT, linewidth=0, zorder=1.5))
     if trajectories is not None:
         plot_trajectories(board.domain, trajectories, ax=ax)
+    if policy is not None:
+        plot_policy(board.domain, policy, speed=speed, ax=ax)
     return ax
 
 
@@ -572,16 +584,45 @@ def _unpadded(trajectories: Demonstrations) -> list[np.ndarray]:
     ]
 
 
-def _draw_learned_gridworld(ax, gridworld, reward, demonstrations, policy) -> None:
+def _draw_learned_gridworld(figure, gridworld, reward, demonstrations, policy) -> None:
     """The left half of `learned_policy_figure`."""
     board = _board(gridworld, Gridworld)
     shapes = (board.num_states,), (board.num_states, len(board.moves))
     reward = _require("reward", reward, *shapes).reshape(board.num_states, -1).max(axis=1)
-    plot_gridworld(gridworld, values=reward, policy=policy, label="true reward", ax=ax)
-    count = f"{demonstrations.num_trajectories} demonstrations"
-    plot_trajectories(gridworld, demonstrations, label=count, ax=ax)
+    ax = plot_gridworld(gridworld, values=reward, label="true reward", ax=figure.subplots())
+    plot_trajectories(gridworld, demonstrations, ax=ax)
+    plot_policy(gridworld, policy, ax=ax)
+    count = demonstrations.num_trajectories
+    _strip(ax, f"Learned from {count} demonstration{'s' * (count != 1)}")
+    lines = _marker("o-", "demonstration", color=VERMILLION, markersize=3)
+    learned = _marker(r"$\rightarrow$", "learned action", markersize=13)
+    _legend(figure, lines, learned, _marker((4, 1, 0), "uniform (no advice)"))
+
+
+def _strip(ax: Axes, title: str) -> None:
+    """Gives axes a title, and takes their scales away."""
     ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
-    ax.set_title(f"Learned from {count}: a policy for every cell", loc="left")
+    ax.set_title(title, loc="left", fontsize="medium")
+
+
+def _marker(shape, label: str, *, color: str = _INK, markersize: float = 6) -> Line2D:
+    """A legend's entry: a marker, followed by "-" for one on a line."""
+    on_line = isinstance(shape, str) and shape.endswith("-")
+    marker, line = (shape[:-1], "-") if on_line else (shape, "")
+    style = {"markersize": markersize, "markeredgewidth": 0}
+    return Line2D([], [], color=color, marker=marker, linestyle=line, label=label, **style)
+
+
+def _legend(figure, *entries) -> None:
+    """Names a picture's signs below it."""
+    figure.legend(
+        handles=entries,
+        loc="outside lower left",
+        ncols=len(entries),
+        frameon=False,
+        handletextpad=0.5,
+        columnspacing=1.5,
+    )
 
 
 def _median_trial(key, racetrack: Racetrack, policy, horizon: int) -> Demonstrations:
@@ -601,15 +642,25 @@ def _draw_trial(ax: Axes, racetrack: Racetrack, trial: Demonstrations, name: str
     plot_trajectories(racetrack, trial, color=color, ax=ax)
     (states,) = _unpadded(trial)
     steps = len(states) - 1
-    here, action, after = states[:-1], np.asarray(trial.actions)[0, :steps], states[1:]
-    reached = np.asarray(racetrack.mdp.next_state)[here, action] == after[:, None]
-    chance = np.asarray(racetrack.mdp.probability)[here, action]
-    off_road = np.asarray(racetrack.off_road)[here, action]
-    certain = (off_road > 0) & (np.where(reached, chance, 0.0).sum(axis=1) <= off_road + 1e-6)
-    cells = np.asarray(racetrack.coordinates)
-    is_crash = certain & (cells[here] == cells[after]).all(axis=1)
-    y, x = cells[here[is_crash]].T
-    ax.plot(x, y, "x", color=VERMILLION, markersize=9, markeredgewidth=2.2, zorder=7)
+    off_road = _off_road_chances(racetrack, states, np.asarray(trial.actions)[0, :steps])
+    y, x = np.asarray(racetrack.coordinates)[states[:-1]][off_road > 0.5].T
+    ax.plot(x, y, "X", color=color, markersize=12, markeredgecolor="white", zorder=5)
     is_finished = bool(np.asarray(racetrack.terminal)[states[-1]])
-    end = f"finish in {steps} steps" if is_finished else f"not there after {steps} steps"
-    ax.set_title(f"{name}: {end}, {is_crash.sum()} off-roads", loc="left")
+    end = f"finish in {steps} steps" if is_finished else f"no finish in {steps} steps"
+    times = round(off_road.sum())
+    _strip(ax, f"{name}: {end}, {times} off-road{'s' * (times != 1)}")
+
+
+def _off_road_chances(racetrack: Racetrack, states, actions) -> np.ndarray:
+    """Probability of an off-road at each step of a trial, [H], given where the step led.
+
+    A car that stands in the same cell afterwards may have braked to a halt, or hit the wall.
+    """
+    here, after = states[:-1], states[1:]
+    mdp = racetrack.mdp
+    is_after = np.asarray(mdp.next_state)[here, actions] == after[:, None]
+    chance = np.where(is_after, np.asarray(mdp.probability)[here, actions], 0.0).sum(axis=1)
+    cells = np.asarray(racetrack.coordinates)
+    stands = np.asarray(~racetrack.speeds.any(axis=1))[after % len(racetrack.speeds)]
+    is_same = (cells[here] == cells[after]).all(axis=1) & stands
+    return np.where(is_same, np.asarray(racetrack.off_road)[here, actions] / chance, 0.0)

@@ -39,7 +39,7 @@ def test_integers_and_booleans_become_floats(dtype):
 def test_float32_keeps_its_type_and_has_its_own_tolerance():
     row = np.array([0.5, 0.50001], np.float32)
     assert checks.require_distribution("row", row).dtype == np.float32
-    with pytest.raises(ValueError, match="sum of row must be 1, got 1.00001"):
+    with pytest.raises(ValueError, match=r"sum of row must be 1, got 1\.00001"):
         checks.require_distribution("row", row.astype(np.float64))
 
 

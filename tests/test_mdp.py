@@ -1,4 +1,4 @@
-"""The model: its two layouts, the one-step maps held to dense NumPy products, and what the constructors refuse."""
+"""The model: its layouts, the one-step maps against dense products, what constructors refuse."""
 
 import re
 
@@ -14,7 +14,7 @@ from jaxhom.mdp import MDP, expected_next_value, push_forward, state_transition
 
 
 def as_successors(transition, rng, extra=2):
-    """Successor lists in random order, each successor split in two, padded by `extra` slots of junk."""
+    """Successor lists in random order, each successor listed twice, with `extra` slots of junk."""
     num_states, num_actions, _ = transition.shape
     width = 2 * int((transition > 0).sum(axis=-1).max()) + extra
     next_state = rng.integers(0, num_states, size=(num_states, num_actions, width))
@@ -36,7 +36,6 @@ def as_successors(transition, rng, extra=2):
         ("dense", True, False, False),
         ("sparse", False, False, False),
         ("restart", False, True, True),
-        ("slow_ring", False, False, False),
         ("dense_krylov", True, False, False),
     ],
 )
@@ -143,7 +142,7 @@ class SweepsTest(chex.TestCase):
             case = small_models.case(name)
             rng = np.random.default_rng(1)
             num_states, num_actions = case.shape
-            for batch in ((), (1,), (5,)):
+            for batch in ((), (5,)):
                 value = rng.normal(size=(num_states, *batch))
                 x = rng.normal(size=(num_states, num_actions, *batch))
                 backward = self.variant(expected_next_value)(case.mdp, value)
@@ -155,11 +154,12 @@ class SweepsTest(chex.TestCase):
 
 
 def test_sweeps_of_every_model(case, rng):
-    value, x = rng.normal(size=case.shape[0]), rng.normal(size=case.shape)
+    """With a batch of one, which goes a way of its own."""
+    value, x = rng.normal(size=(case.shape[0], 1)), rng.normal(size=(*case.shape, 1))
     backward = jax.jit(expected_next_value)(case.mdp, value)
     np.testing.assert_allclose(backward, case.transition @ value, rtol=0, atol=1e-13)
     forward = jax.jit(push_forward)(case.mdp, x)
-    expected = np.einsum("saz,sa->z", case.transition, x)
+    expected = np.einsum("saz,sab->zb", case.transition, x)
     np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-12)
 
 
@@ -305,14 +305,22 @@ CHANCES = np.full((2, 1, 2), 0.5)
 @pytest.mark.parametrize(
     ("next_state", "probability", "message"),
     [
-        (STATES[0], CHANCES[0], "next_state must have shape [S, A, N] with S, A, N >= 1, got (1, 2)"),
+        (
+            STATES[0],
+            CHANCES[0],
+            "next_state must have shape [S, A, N] with S, A, N >= 1, got (1, 2)",
+        ),
         (STATES[..., :0], CHANCES[..., :0], "with S, A, N >= 1, got (2, 1, 0)"),
         (STATES, CHANCES[..., :1], "probability must have shape (2, 1, 2), got (2, 1, 1)"),
         (changed(STATES, (1, 0, 1), 2), CHANCES, "next_state[1, 0, 1] must be below 2, got 2"),
         (changed(STATES, (0, 0, 1), -1), CHANCES, "next_state[0, 0, 1] must not be negative"),
         (STATES + 0.5, CHANCES, "next_state[0, 0, 0] must be whole, got 0.5"),
         (STATES, changed(CHANCES, (1, 0, 0), np.nan), "probability[1, 0, 0] must be finite"),
-        (STATES, changed(CHANCES, (1, 0), (1.5, -0.5)), "probability[1, 0, 1] must not be negative"),
+        (
+            STATES,
+            changed(CHANCES, (1, 0), (1.5, -0.5)),
+            "probability[1, 0, 1] must not be negative",
+        ),
         (STATES, changed(CHANCES, (1, 0, 0), 0.6), "sum of probability[1, 0] must be 1, got 1.1"),
     ],
 )

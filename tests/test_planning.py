@@ -1,4 +1,4 @@
-"""Optimal plans against policy iteration in NumPy; residuals and bounds against their definitions."""
+"""Optimal plans against policy iteration in NumPy; residuals and bounds, by their definitions."""
 
 import functools
 
@@ -61,9 +61,7 @@ def test_against_policy_iteration(case):
 def test_the_policy_is_worth_what_the_plan_says(case):
     reward = reward_of(case.name)
     plan = optimal_policy(case.mdp, reward)
-    achieved = oracles.policy_value(
-        case.transition, case.discount, np.asarray(plan.policy), reward
-    )
+    achieved = oracles.policy_value(case.transition, case.discount, np.asarray(plan.policy), reward)
     np.testing.assert_allclose(achieved, optimum(case.name)[0], rtol=0, atol=1e-6)
 
 
@@ -82,15 +80,13 @@ def test_residual_and_bounds_hold_at_every_tolerance(name, tolerance):
     error = np.abs(value - optimum(name)[0]).max()
     assert error <= plan.residual / (1 - case.discount) + 1e-12 * scale
     assert np.all(plan.upper_bound(case.mdp) >= optimum(name)[0] - 1e-13 * scale)
-    achieved = oracles.policy_value(
-        case.transition, case.discount, np.asarray(plan.policy), reward
-    )
+    achieved = oracles.policy_value(case.transition, case.discount, np.asarray(plan.policy), reward)
     loss = (optimum(name)[0] - achieved).max()
     # twice the residual for the value, four times for actions that tie
     assert loss <= 6 * plan.residual / (1 - case.discount) + 1e-9
 
 
-@pytest.mark.parametrize("max_iterations", [0, 1, 5])
+@pytest.mark.parametrize("max_iterations", [0, 5])
 def test_a_plan_that_is_cut_short_says_so_and_its_bound_holds(max_iterations):
     case, reward = small_models.case("restart"), reward_of("restart")
     plan = optimal_policy(case.mdp, reward, max_iterations=max_iterations)
@@ -105,14 +101,14 @@ def test_a_plan_that_is_cut_short_says_so_and_its_bound_holds(max_iterations):
 def test_extreme_discounts(discount):
     case = small_models.case("restart")._replace(discount=discount)
     reward = reward_of("restart")
-    plan = optimal_policy(case.mdp.replace(discount=jnp.asarray(discount)), reward)
+    plan = optimal_policy(case.mdp.replace(discount=np.asarray(discount)), reward)
     value, action_value = oracles.optimal_value(case.transition, discount, reward)
     np.testing.assert_allclose(plan.value, value, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(plan.policy.argmax(axis=1), first_best(action_value, 1e-8))
 
 
 def test_a_model_that_never_mixes():
-    """Two absorbing states of different worth: the span of the error shrinks by the discount alone."""
+    """Two ends of different worth: the span of the error shrinks by the discount alone."""
     case = small_models.case("absorbing")
     reward = np.array([[0, 0], [0, 0], [1, 1], [0, 0], [-1, -1], [-1, -1]])
     plan = optimal_policy(case.mdp, reward)
@@ -142,7 +138,7 @@ def test_equal_actions_go_to_the_lowest():
 
 
 def test_ties_of_a_gridworld_are_not_left_to_rounding():
-    """To the far corner right and down are equally good in the interior: down is the lower action."""
+    """To the far corner, right and down are equally good inside: down is the lower action."""
     world = gridworld(6, discount=0.99)
     reward = np.zeros(36)
     reward[-1] = 1.0
@@ -155,9 +151,7 @@ def test_ties_of_a_gridworld_are_not_left_to_rounding():
     np.testing.assert_array_equal(actions[rows == columns][:-1], 1)
 
 
-@pytest.mark.parametrize(
-    ("slack", "expected"), [(0.0, [2, 0]), (0.1, [1, 0]), (5.0, [0, 0])]
-)
+@pytest.mark.parametrize(("slack", "expected"), [(0.0, [2, 0]), (0.1, [1, 0]), (5.0, [0, 0])])
 def test_greedy_policy(slack, expected):
     action_value = np.array([[0.0, 0.95, 1.0], [2.0, 2.0, 2.0]])
     np.testing.assert_array_equal(greedy_policy(action_value, slack), np.eye(3)[expected])
@@ -165,7 +159,7 @@ def test_greedy_policy(slack, expected):
     np.testing.assert_array_equal(greedy_policy(batch, slack)[1], np.eye(3)[expected])
 
 
-@pytest.mark.parametrize("name", ["one_state", "dense", "restart"])
+@pytest.mark.parametrize("name", ["one_state", "restart"])
 @pytest.mark.parametrize("discount", [0.9, 0.999])
 def test_float32_stops_by_itself_and_its_bound_holds(name, discount):
     """Against the optimum of the rounded model, in float64."""
@@ -212,7 +206,7 @@ def test_batches_agree_with_single_rewards_lane_by_lane(name):
 
 def test_state_rewards_hold_for_every_action():
     case = small_models.case("dense")
-    rewards = np.random.default_rng(22).normal(size=(2, 7))
+    rewards = np.random.default_rng(22).normal(size=(3, 7))
     spread = np.repeat(rewards[..., None], 3, axis=2)
     for state_reward, reward in ((rewards, spread), (rewards[0], spread[0])):
         chex.assert_trees_all_equal(
@@ -232,8 +226,8 @@ def test_a_former_value_saves_the_sweeps():
     assert cold.iterations > 20
     warm = optimal_policy(case.mdp, reward, initial_value=cold.value)
     assert warm.iterations <= 2
-    rewards = np.stack([reward, reward])
-    for start in (cold.value, jnp.stack([cold.value, cold.value + 1])):
+    rewards = np.stack([reward] * 3)
+    for start in (cold.value, jnp.stack([cold.value, cold.value + 1, cold.value])):
         lanes = optimal_policy(case.mdp, rewards, initial_value=start)
         assert np.all(lanes.iterations <= 2)
         np.testing.assert_allclose(lanes.value[1], cold.value, rtol=0, atol=1e-7)

@@ -5,8 +5,8 @@ matter are made: solve the game over the present ones for row weights w and colu
 response to w, and repeat. The mixture sum_j q_j x_j of occupancies is the occupancy of a policy, so the game's lower
 bound is that policy's margin; planning for any w gives the upper bound.
 
-The weights of a game over few columns jump about. Asking instead half-way between them and the weights of the best
-bound so far (in-out separation, Ben-Ameur and Neto 2007) needs far fewer columns.
+With many features the weights of a game over few columns jump about. Asking for the response to weights between them
+and those of the best bound so far (in-out separation, Ben-Ameur and Neto 2007) then needs far fewer columns.
 """
 
 import jax
@@ -22,6 +22,9 @@ from jaxhom.pdhg.matrix_game import MatrixGame
 
 _FIRST_CAPACITY = 8
 _GROWTH = 4
+_STABILISED_FEATURES = 8  # up to here the weights do not jump
+_STABILISATION = 0.3  # share of the best bound's weights in a query
+_LOOSE_PLANNING = 0.1  # share of an open gap that planning may add to the bound
 _GAME_ITERATIONS = 4096  # per column: an inexact game still gives valid weights
 
 
@@ -38,7 +41,9 @@ def solve_by_columns(
     lanes, num_features = expectations.shape
     weights = jnp.full((lanes, num_features), 1.0 / num_features, mdp.dtype)
     value = jnp.zeros((lanes, mdp.num_states), mdp.dtype)
-    bound, value, x, column = _respond(mdp, expectations, weights, value, tolerance)
+    pull = _STABILISATION if num_features > _STABILISED_FEATURES else 0.0
+    accuracy = jnp.full(lanes, tolerance, mdp.dtype)
+    bound, value, x, column = _respond(mdp, expectations, weights, value, accuracy)
     columns = _Columns(expectations)
     columns.add(x, column)
     if initial_policy is not None:
@@ -51,8 +56,9 @@ def solve_by_columns(
             bar.update()
             if (gap <= tolerance).all() or columns.count >= max_iterations:
                 break
-            query = 0.5 * (bound.weights + game.best_primal.T)
-            new_bound, value, x, column = _respond(mdp, expectations, query, value, tolerance)
+            query = pull * bound.weights + (1.0 - pull) * game.best_primal.T
+            accuracy = jnp.asarray(np.maximum(_LOOSE_PLANNING * gap, tolerance), mdp.dtype)
+            new_bound, value, x, column = _respond(mdp, expectations, query, value, accuracy)
             bound = better_bound(bound, new_bound)
             columns.add(x, column)
             gap = np.asarray(bound.margin_bound - game.lower)

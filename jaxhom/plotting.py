@@ -91,10 +91,7 @@ def plot_gridworld(
     board = _board(gridworld, Gridworld)
     if values is not None:
         values = _require("values", values, (board.num_states,))
-    ax = _ground(board, ax, _BAR_ROOM * (values is not None))
-    if values is not None:
-        _heat(ax, board, values, label)
-    return _overlay(board, ax, visited, policy, trajectories)
+    return _plot_domain(board, values, label, visited, trajectories, policy, (0, 0), ax)
 
 
 def plot_racetrack(
@@ -131,10 +128,7 @@ def plot_racetrack(
     if values is not None:
         values = _require("values", values, (board.num_cells,), (board.num_states,))
         values = values.reshape(board.num_cells, -1).max(axis=1)
-    ax = _ground(board, ax, _BAR_ROOM * (values is not None))
-    if values is not None:
-        _heat(ax, board, values, label)
-    return _overlay(board, ax, visited, policy, trajectories, speed)
+    return _plot_domain(board, values, label, visited, trajectories, policy, speed, ax)
 
 
 def plot_policy(
@@ -166,26 +160,9 @@ def plot_policy(
       ValueError: if a shape does not fit the domain, or there is no such speed.
     """
     board = _board(domain)
-    shape = (board.num_states, len(board.moves))
-    policy = _require("policy", policy, shape)[board.states_at(speed)]
-    policy = np.where(board.is_open[:, None] & (policy >= _LEAST_PROBABILITY), policy, 0.0)
+    policy = _policy_at(board, policy, speed)
     ax = _ground(board, ax) if ax is None else ax
-    arrow = 0.8 * policy[..., None] * board.moves  # [C, A, (row, column)]
-    # Half the mean move behind the centre: one arrow alone is centred in its cell, a rose as well.
-    tail = np.broadcast_to(
-        board.cells[:, None] - 0.5 * arrow.sum(axis=1, keepdims=True), arrow.shape
-    )
-    shown = arrow.any(axis=-1)
-    y, x, dy, dx = np.concatenate([tail[shown], arrow[shown]], axis=-1).T
-    style = {"width": 0.075, "headwidth": 3.8, "headlength": 3.8, "headaxislength": 3.4}
-    placed = {"angles": "xy", "units": "xy", "scale_units": "xy", "scale": 1.0}
-    ax.quiver(x, y, dx, dy, color=color, zorder=4, **placed, **style)
-    cell, action = np.nonzero((policy > 0) & ~board.moves.any(axis=-1))
-    if cell.size:
-        size = 0.3 * np.sqrt(policy[cell, action])
-        place = {"offsets": board.cells[cell, ::-1], "offset_transform": ax.transData}
-        dots = EllipseCollection(size, size, 0.0, units="xy", **place, color=color, zorder=4)
-        ax.add_collection(dots, autolim=False)
+    _draw_arrows(ax, board, policy, color)
     return ax
 
 
@@ -393,23 +370,26 @@ def learned_policy_figure(
     """
     if not racetrack_policies:
         raise ValueError("racetrack_policies must name at least one policy")
-    num = len(racetrack_policies)
-    rows, columns = _board(racetrack, Racetrack).shape
-    strip = min(_STRIP_WIDTH * rows / columns, 2.5)
-    height = max(5.5, 0.45 + num * (strip + 0.35))
-    widths = height + 0.5, _STRIP_WIDTH + 0.1
-    figure = plt.figure(figsize=(sum(widths), height), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=widths)
-    _draw_learned_gridworld(left, gridworld, reward, gridworld_demonstrations, gridworld_policy)
+    world = _board(gridworld, Gridworld)
+    reward = _require("reward", reward, (world.num_states,), (world.num_states, len(world.moves)))
+    arrows = _policy_at(world, gridworld_policy, (0, 0))
+    gridworld_demonstrations.validate(world.mdp)
     visited, _ = empirical_policy(racetrack.mdp, racetrack_demonstrations)
+    trials = {
+        name: _median_trial(key, racetrack, policy, horizon)
+        for name, policy in racetrack_policies.items()
+    }
+    left, right = _two_halves(_board(racetrack, Racetrack), len(trials))
+    reward = reward.reshape(world.num_states, -1).max(axis=1)
+    _draw_learned_gridworld(left, world, reward, gridworld_demonstrations, arrows)
     palette = itertools.cycle((BLACK, VERMILLION, BLUE, PURPLE, GREEN, ORANGE))
-    axes = right.subplots(num, squeeze=False)[:, 0]
-    for ax, color, (name, policy) in zip(axes, palette, racetrack_policies.items(), strict=False):
+    axes = right.subplots(len(trials), squeeze=False)[:, 0]
+    for ax, color, (name, trial) in zip(axes, palette, trials.items(), strict=False):
         plot_racetrack(racetrack, visited=visited, ax=ax)
-        _draw_trial(ax, racetrack, _median_trial(key, racetrack, policy, horizon), name, color)
+        _draw_trial(ax, racetrack, trial, name, color)
     demonstrated = Patch(color=_TINT, label="demonstrated")
     _legend(right, demonstrated, _marker("o-", "steps of a trial"), _marker("X", "off-road"))
-    return figure
+    return left.figure
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -562,18 +542,52 @@ def _heat(ax: Axes, board: _Board, values: np.ndarray, label: str, norm=None) ->
     _colorbar(ax, board, image, label)
 
 
-def _overlay(board: _Board, ax: Axes, visited, policy, trajectories, speed=(0, 0)) -> Axes:
-    """Draws on a domain what is given."""
+def _plot_domain(board, values, label, visited, trajectories, policy, speed, ax) -> Axes:
+    """Draws a domain, and on it what is given; checks everything before it draws anything."""
     if visited is not None:
         visited = _require("visited", visited, (board.num_states,)) > 0
+    if trajectories is not None:
+        trajectories.validate(board.mdp)
+    if policy is not None:
+        policy = _policy_at(board, policy, speed)
+    ax = _ground(board, ax, _BAR_ROOM * (values is not None))
+    if values is not None:
+        _heat(ax, board, values, label)
+    if visited is not None:
         cells = board.cells[visited.reshape(board.num_cells, -1).any(axis=1) & board.is_open]
         tint = [Rectangle((x - 0.4, y - 0.4), 0.8, 0.8) for y, x in cells]
         ax.add_collection(PatchCollection(tint, facecolor=_TINT, linewidth=0, zorder=1.5))
     if trajectories is not None:
         plot_trajectories(board.domain, trajectories, ax=ax)
     if policy is not None:
-        plot_policy(board.domain, policy, speed=speed, ax=ax)
+        _draw_arrows(ax, board, policy, _INK)
     return ax
+
+
+def _policy_at(board: _Board, policy, speed) -> np.ndarray:
+    """[S, A] -> the probabilities to draw, [C, A]: of one speed, of open cells, not negligible."""
+    shape = (board.num_states, len(board.moves))
+    policy = _require("policy", policy, shape)[board.states_at(speed)]
+    return np.where(board.is_open[:, None] & (policy >= _LEAST_PROBABILITY), policy, 0.0)
+
+
+def _draw_arrows(ax: Axes, board: _Board, policy: np.ndarray, color: str) -> None:
+    """Draws probabilities [C, A] as arrows, and as dots where the action is not to move."""
+    arrow = 0.8 * policy[..., None] * board.moves  # [C, A, (row, column)]
+    # Half the mean move behind the centre: one arrow alone is centred in its cell, a rose as well.
+    tail = board.cells[:, None] - 0.5 * arrow.sum(axis=1, keepdims=True)
+    shown = arrow.any(axis=-1)
+    tail = np.broadcast_to(tail, arrow.shape)[shown]
+    y, x, dy, dx = np.concatenate([tail, arrow[shown]], axis=-1).T
+    style = {"width": 0.075, "headwidth": 3.8, "headlength": 3.8, "headaxislength": 3.4}
+    placed = {"angles": "xy", "units": "xy", "scale_units": "xy", "scale": 1.0}
+    ax.quiver(x, y, dx, dy, color=color, zorder=4, **placed, **style)
+    cell, action = np.nonzero((policy > 0) & ~board.moves.any(axis=-1))
+    if cell.size:
+        size = 0.3 * np.sqrt(policy[cell, action])
+        placed = {"offsets": board.cells[cell, ::-1], "offset_transform": ax.transData}
+        dots = EllipseCollection(size, size, 0.0, units="xy", color=color, zorder=4, **placed)
+        ax.add_collection(dots, autolim=False)
 
 
 def _unpadded(trajectories: Demonstrations) -> list[np.ndarray]:
@@ -584,14 +598,21 @@ def _unpadded(trajectories: Demonstrations) -> list[np.ndarray]:
     ]
 
 
-def _draw_learned_gridworld(figure, gridworld, reward, demonstrations, policy) -> None:
+def _two_halves(board: _Board, num_strips: int):
+    """A new figure's halves: a square one, and one for pictures of `board` below each other."""
+    rows, columns = board.shape
+    strip = min(_STRIP_WIDTH * rows / columns, 2.5)
+    height = max(5.5, 0.45 + num_strips * (strip + 0.35))
+    widths = height + 0.5, _STRIP_WIDTH + 0.1
+    figure = plt.figure(figsize=(sum(widths), height), layout="constrained")
+    return figure.subfigures(1, 2, width_ratios=widths)
+
+
+def _draw_learned_gridworld(figure, board: _Board, reward, demonstrations, arrows) -> None:
     """The left half of `learned_policy_figure`."""
-    board = _board(gridworld, Gridworld)
-    shapes = (board.num_states,), (board.num_states, len(board.moves))
-    reward = _require("reward", reward, *shapes).reshape(board.num_states, -1).max(axis=1)
-    ax = plot_gridworld(gridworld, values=reward, label="true reward", ax=figure.subplots())
-    plot_trajectories(gridworld, demonstrations, ax=ax)
-    plot_policy(gridworld, policy, ax=ax)
+    ax = plot_gridworld(board.domain, values=reward, label="true reward", ax=figure.subplots())
+    plot_trajectories(board.domain, demonstrations, ax=ax)
+    _draw_arrows(ax, board, arrows, _INK)
     count = demonstrations.num_trajectories
     _strip(ax, f"Learned from {count} demonstration{'s' * (count != 1)}")
     lines = _marker("o-", "demonstration", color=VERMILLION, markersize=3)

@@ -14,7 +14,7 @@ from jaxhom.mdp import MDP
 from jaxhom.planning import optimal_policy
 
 S, A, B, H = 12, 3, 4, 6  # one horizon and one number of trials for most tests: compiled once
-TRIALS = 4000
+TRIALS = 2000
 SCALARS = ("reward_per_step", "total_reward", "steps", "finished")
 
 
@@ -115,13 +115,13 @@ def test_without_terminal_states_every_trial_takes_all_steps(case):
 
 
 @pytest.mark.parametrize(
-    ("horizon", "count", "steps", "finished"),
-    [(2, True, 2, 0), (3, False, 3, 1), (3, True, 3, 1), (5, False, 3, 1), (5, True, 4, 1)],
+    ("goal", "count", "steps", "finished"),
+    [(4, True, 3, 0), (3, False, 3, 1), (3, True, 3, 1), (2, False, 2, 1), (2, True, 3, 1)],
 )
-def test_a_chain_by_hand(horizon, count, steps, finished):
-    rewards = np.array([[1.0], [2.0], [3.0], [10.0]])
-    arguments = (chain(4), np.ones((4, 1)), rewards, horizon)
-    options = {"terminal": np.arange(4) == 3, "count_terminal_step": count}
+def test_a_chain_by_hand(goal, count, steps, finished):
+    rewards = np.array([[1.0], [2.0], [10.0], [20.0], [30.0]])
+    arguments = (chain(5), np.ones((5, 1)), rewards, 3)
+    options = {"terminal": np.arange(5) == goal, "count_terminal_step": count}
     exact = evaluate_exactly(*arguments, **options)
     sampled = evaluate_by_sampling(jax.random.key(0), *arguments, num_trials=2, **options)
     for ours in (exact, sampled):
@@ -176,13 +176,13 @@ def test_sampling_is_within_four_standard_errors(case, count_terminal_step):
 def test_standard_errors_are_the_spread_of_repeated_estimates(case):
     arguments = (case["mdp"], case["policies"][0], case["rewards"][0], H)
 
-    def estimate(key):
-        return evaluate_by_sampling(key, *arguments, num_trials=100, **case["options"])
-
-    estimates = jax.vmap(estimate)(jax.random.split(jax.random.key(2), 400))
+    keys = jax.random.split(jax.random.key(2), 80)
+    options = {"num_trials": TRIALS, **case["options"]}
+    estimates = [evaluate_by_sampling(key, *arguments, **options) for key in keys]
+    estimates = jax.tree.map(lambda *leaves: np.stack(leaves), *estimates)
     spread = jax.tree.map(np.std, estimates.replace(standard_error=None))
     claimed = jax.tree.map(np.mean, estimates.standard_error)
-    chex.assert_trees_all_close(spread, claimed, rtol=0.15)
+    chex.assert_trees_all_close(spread, claimed, rtol=0.25)
 
 
 def test_sampling_on_the_racetrack(track):
@@ -194,20 +194,29 @@ def test_sampling_on_the_racetrack(track):
 # ------------------------------------------------------------------------- batches, jit, gradients
 
 
-@pytest.mark.parametrize("is_reward_batched", [False, True])
-def test_a_batch_is_its_lanes(case, is_reward_batched):
+def test_a_batch_is_its_lanes(case):
     key, options = jax.random.key(5), case["options"] | {"count_terminal_step": True}
-    rewards = case["rewards"] if is_reward_batched else case["rewards"][0]
-    batch = (case["mdp"], case["policies"], rewards, H)
+    batch = (case["mdp"], case["policies"], case["rewards"], H)
     exact = evaluate_exactly(*batch, **options)
     sampled = evaluate_by_sampling(key, *batch, num_trials=TRIALS, **options)
     chex.assert_tree_shape_prefix((exact, sampled), (B,))
     for b in range(B):
-        single = (case["mdp"], case["policies"][b], case["rewards"][b * is_reward_batched], H)
+        single = (case["mdp"], case["policies"][b], case["rewards"][b], H)
         ours = evaluate_exactly(*single, **options)
         chex.assert_trees_all_close(lane(exact, b), ours, rtol=1e-9)
         ours = evaluate_by_sampling(key, *single, num_trials=TRIALS, **options)
         chex.assert_trees_all_close(lane(sampled, b), ours, rtol=1e-9)
+
+
+def test_one_reward_serves_a_batch_of_policies(case):
+    one, key = case["rewards"][0], jax.random.key(5)
+    for evaluate in (
+        evaluate_exactly,
+        lambda *batch: evaluate_by_sampling(key, *batch, num_trials=TRIALS),
+    ):
+        shared = evaluate(case["mdp"], case["policies"], one, H)
+        repeated = evaluate(case["mdp"], case["policies"], np.stack([one] * B), H)
+        chex.assert_trees_all_close(shared, repeated, rtol=1e-9)
 
 
 def test_the_dense_layout_is_the_sparse_one(case):
@@ -237,9 +246,7 @@ def test_under_jit_and_vmap(case):
         return evaluate_exactly(*arguments, **case["options"]), sampled, weighted
 
     eager = evaluate(case["policies"][1], case["rewards"][1])
-    jitted = jax.jit(evaluate)(case["policies"][1], case["rewards"][1])
-    lanes = jax.vmap(evaluate)(case["policies"], case["rewards"])
-    chex.assert_trees_all_close(jitted, eager, rtol=1e-9)
+    lanes = jax.jit(jax.vmap(evaluate))(case["policies"], case["rewards"])
     chex.assert_trees_all_close(lane(lanes, 1), eager, rtol=1e-9)
 
 
@@ -247,7 +254,9 @@ def test_policies_of_one_shape_are_compiled_once(case):
     def evaluate(index):
         arguments = (case["mdp"], case["policies"][index], case["rewards"][index], H)
         evaluate_exactly(*arguments, **case["options"])
-        evaluate_by_sampling(jax.random.key(index), *arguments, num_trials=TRIALS)
+        evaluate_by_sampling(
+            jax.random.key(index), *arguments, num_trials=TRIALS, **case["options"]
+        )
 
     jitted = (evaluation._evaluate_visits, evaluation._evaluate_trials)
     evaluate(0)
@@ -287,8 +296,12 @@ def test_float32_stays_float32(case):
     mdp = MDP.from_dense(transition.astype(np.float32), discount=0.9, initial=initial)
     arguments = (case["policies"][0], case["rewards"][0], H)
     exact = evaluate_exactly(mdp, *arguments, **case["options"])
-    sampled = evaluate_by_sampling(jax.random.key(0), mdp, *arguments, **case["options"])
-    assert {leaf.dtype for leaf in jax.tree.leaves((exact, sampled))} == {np.dtype(np.float32)}
+    assert {leaf.dtype for leaf in jax.tree.leaves(exact)} == {np.dtype(np.float32)}
+    sampled = jax.eval_shape(
+        lambda key: evaluate_by_sampling(key, mdp, *arguments, **case["options"]),
+        jax.random.key(0),
+    )
+    assert {leaf.dtype for leaf in jax.tree.leaves(sampled)} == {np.dtype(np.float32)}
     expected = evaluate_exactly(case["mdp"], *arguments, **case["options"])
     chex.assert_trees_all_close(exact, jax.tree.map(np.float32, expected), rtol=1e-5)
 

@@ -104,7 +104,8 @@ def run(*, size: int, regions: int, demonstrations: list[int], sets: int, seed: 
             rows.append((setting.title,) + ("",) * (len(HEADER) - 1))
             found = _learn(setting, bar.update)
             rows += [row.cells() for row in _evaluate(setting, found)] + [()]
-            policies[type(domain)] = (domain, setting, {name: policy[0] for name, (policy, _) in found.items()})
+            first = {name: policy[0] for name, (policy, _) in found.items()}
+            policies.setdefault(type(domain), (domain, setting, first))
     print(format_table(HEADER, rows[:-1]))
     print(f"\nMeans over {sets} sets of demonstrations; exact evaluation in trials of the demonstrations' length")
     print(f"(gridworld {_GRID_TRIAL}) or {_TRACK_TRIAL} steps (racetrack). `loss <=` and `LPAL gap` are per step.")
@@ -200,7 +201,7 @@ def _evaluate(setting: _Setting, found: dict[str, tuple[jax.Array, jax.Array]]) 
 
 
 def _draw(key, path: str, policies: dict) -> None:
-    """Saves the picture of the last block of each domain."""
+    """Saves the picture of the first block of each domain."""
     try:
         from jaxhom.plotting import learned_policy_figure
     except ImportError:

@@ -125,8 +125,9 @@ def _write(path: str | os.PathLike, arrays: Mapping[str, object]) -> None:
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """All arrays of an archive."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
+        with open(path, "rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if isinstance(archive, np.ndarray):
                 raise FileError(f"{path}: one array, not an .npz archive of named arrays")
             arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError:

@@ -64,8 +64,8 @@ def _compute_once(project, point: jax.Array) -> jax.Array:
 
     The branch is always taken, but XLA does not know: the operand of a conditional must exist as an array.
     """
-    is_number = point.ravel()[0] > -jnp.inf
-    return jax.lax.cond(is_number, project, lambda point: jnp.full_like(point, jnp.nan), point)
+    is_usual = point.ravel()[0] != -jnp.inf  # NaN is usual: it must not spoil the lanes beside it
+    return jax.lax.cond(is_usual, project, lambda point: jnp.full_like(point, jnp.nan), point)
 
 
 def _threshold(point: jax.Array, total, axes: tuple[int, ...]) -> jax.Array:

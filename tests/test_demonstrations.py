@@ -261,7 +261,7 @@ def test_sampled_expectations_approach_the_exact_ones():
     """Eq. (6) on long samples, within five standard errors of V(pi)."""
     case = small_models.case("dense")
     policy = small_models.random_policy(np.random.default_rng(4), *case.shape)
-    demonstrations = sample_demonstrations(jax.random.key(5), case.mdp, policy, 4000, 120)
+    demonstrations = sample_demonstrations(jax.random.key(5), case.mdp, policy, 1000, 100)
     # [20, M / 20, H]: on 20 groups
     groups = jax.tree.map(lambda x: x.reshape(20, -1, x.shape[-1]), demonstrations)
     sample = jax.vmap(monte_carlo_feature_expectations, (None, 0))(case.mdp, groups)

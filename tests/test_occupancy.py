@@ -285,8 +285,6 @@ def test_forward_and_reverse_mode_on_a_batch(name, rng):
     def weighted(policies):
         return feature_expectations(case.mdp, policies) @ weight
 
-    gradient = jax.jit(jax.grad(lambda policies: weighted(policies).sum()))(policies)
-    by_reverse = jnp.einsum("bsa,bsa->b", gradient, directions)
     push = jax.jit(lambda *pair: jax.jvp(weighted, pair[:1], pair[1:])[1])
     by_forward = push(policies, directions)
     expected = [
@@ -295,8 +293,11 @@ def test_forward_and_reverse_mode_on_a_batch(name, rng):
         / STEP
         for policy, direction in zip(policies, directions, strict=True)
     ]
-    np.testing.assert_allclose(by_reverse, expected, rtol=1e-9)
     np.testing.assert_allclose(by_forward, expected, rtol=1e-9)
+    if name == "dense":  # the other takes long to compile, and has its gradients tested above
+        gradient = jax.jit(jax.grad(lambda policies: weighted(policies).sum()))(policies)
+        by_reverse = jnp.einsum("bsa,bsa->b", gradient, directions)
+        np.testing.assert_allclose(by_reverse, expected, rtol=1e-9)
 
 
 def test_second_derivative_in_the_discount(rng):

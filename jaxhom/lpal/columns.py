@@ -21,7 +21,7 @@ from jaxhom.pdhg import Status, engine
 from jaxhom.pdhg.matrix_game import MatrixGame
 
 _FIRST_CAPACITY = 8
-_GROWTH = 4
+_GROWTH = 2
 _STABILISED_FEATURES = 8  # up to here the weights do not jump
 _STABILISATION = 0.3  # share of the best bound's weights in a query
 _LOOSE_PLANNING = 0.1  # share of an open gap that planning may add to the bound
@@ -75,20 +75,20 @@ class _Columns:
         lanes, num_features = expectations.shape
         self.count = 0
         self._occupancies: list[jax.Array] = []
-        self._payoff = np.zeros((num_features, _FIRST_CAPACITY, lanes), expectations.dtype)
+        self._payoff = np.zeros((lanes, num_features, _FIRST_CAPACITY), expectations.dtype)
 
     def add(self, x: jax.Array, column: jax.Array) -> None:
         """Adds one policy per lane: occupancy [B, S, A] and V(pi) - Vhat [B, K]."""
-        if self.count == self._payoff.shape[1]:
+        if self.count == self._payoff.shape[2]:
             room = np.zeros_like(self._payoff)
-            self._payoff = np.concatenate([self._payoff] + [room] * (_GROWTH - 1), axis=1)
-        self._payoff[:, self.count] = np.asarray(column).T
+            self._payoff = np.concatenate([self._payoff] + [room] * (_GROWTH - 1), axis=2)
+        self._payoff[:, :, self.count] = np.asarray(column)
         self._occupancies.append(x)
         self.count += 1
 
     def play(self, former: engine.PDHGState | None, tolerance) -> engine.PDHGState:
         """Solves the game to the tolerance (scalar or [B]), started from the former strategies."""
-        _, capacity, lanes = self._payoff.shape
+        lanes, _, capacity = self._payoff.shape
         is_column = np.broadcast_to((np.arange(capacity) < self.count)[:, None], (capacity, lanes))
         if former is None:
             start = None
@@ -111,8 +111,8 @@ class _Columns:
 @jax.jit
 def _play(payoff, is_column, start, tolerance) -> engine.PDHGState:
     """Payoffs are scaled to at most 1 per lane inside, and the bounds back."""
-    scale = jnp.maximum(jnp.abs(payoff).max(axis=(0, 1)), jnp.finfo(payoff.dtype).tiny)
-    game = MatrixGame(payoff=payoff / scale, is_column=is_column)
+    scale = jnp.maximum(jnp.abs(payoff).max(axis=(1, 2)), jnp.finfo(payoff.dtype).tiny)
+    game = MatrixGame(payoff=payoff / scale[:, None, None], is_column=is_column)
     state = engine.init(game, start)
     state = engine.solve(game, state, tolerance=tolerance / scale, max_iterations=_GAME_ITERATIONS)
     return state.replace(lower=state.lower * scale, upper=state.upper * scale)

@@ -1,4 +1,4 @@
-"""Zero-sum matrix games as saddle-point problems, lanes last.
+"""Zero-sum matrix games as saddle-point problems.
 
     value = min_{w in simplex} max_{q in simplex} <w, M q>,   M [K, m].
 
@@ -10,7 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxhom.pdhg.projections import project_simplex, reduce_leading
+from jaxhom.pdhg.projections import project_simplex
 
 _ABSENT = -1e30  # keeps the probability of a column that does not exist at zero
 
@@ -20,7 +20,8 @@ class MatrixGame:
     """A batch of games.
 
     Attributes:
-      payoff: [K, m, lanes], M.
+      payoff: [lanes, K, m], M. The lanes come first here alone: batched products of matrices that are not tiny want
+        them there.
       is_column: bool [m, lanes], which columns exist; at least one.
     """
 
@@ -29,21 +30,17 @@ class MatrixGame:
 
     def start(self) -> tuple[jax.Array, jax.Array]:
         """Uniform strategies."""
-        rows, columns, lanes = self.payoff.shape
+        lanes, rows, columns = self.payoff.shape
         w = jnp.full((rows, lanes), 1.0 / rows, self.payoff.dtype)
         return w, self.project_dual(jnp.zeros((columns, lanes), self.payoff.dtype), None)
 
     def forward(self, w: jax.Array) -> jax.Array:
         """M^T w, [K, lanes] -> [m, lanes]."""
-        if w.shape[-1] == 1:
-            return (self.payoff[..., 0].T @ w[:, 0])[:, None]
-        return reduce_leading(self.payoff * w[:, None], (0,))
+        return jnp.einsum("bkm,kb->mb", self.payoff, w)
 
     def adjoint(self, q: jax.Array) -> jax.Array:
         """M q, [m, lanes] -> [K, lanes]."""
-        if q.shape[-1] == 1:
-            return (self.payoff[..., 0] @ q[:, 0])[:, None]
-        return reduce_leading(self.payoff * q, (1,))
+        return jnp.einsum("bkm,mb->kb", self.payoff, q)
 
     def project_primal(self, point: jax.Array, step) -> jax.Array:
         """Onto the simplex of the rows."""
@@ -65,4 +62,4 @@ class MatrixGame:
     def norm_bound(self) -> jax.Array:
         """sqrt(|M|_1 |M|_inf)."""
         size = jnp.abs(self.payoff)
-        return jnp.sqrt(size.sum(axis=0).max(axis=0) * size.sum(axis=1).max(axis=0))
+        return jnp.sqrt(size.sum(axis=1).max(axis=1) * size.sum(axis=2).max(axis=1))

@@ -7,6 +7,7 @@ feature expectations come from linear solves, and LPAL turns them into a policy 
 Importing the library changes no JAX setting. For float64, set `jax_enable_x64` before making models.
 """
 
+from jaxhom.brackets import LocalSimilarity
 from jaxhom.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -22,7 +23,6 @@ from jaxhom.generalization import (
     soft_local_homomorphism,
 )
 from jaxhom.homomorphism import (
-    LocalSimilarity,
     homomorphism_error,
     local_similarity,
     locally_similar,

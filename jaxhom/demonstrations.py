@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.mdp import MDP
-from jaxhom.occupancy import check_policy_shape
+from jaxhom.mdp import MDP, check_policy_shape
 
 
 @chex.dataclass(frozen=True)
@@ -156,9 +155,7 @@ def sample_demonstrations(
     check_policy_shape(mdp, policy)
     checks.require_shape("policy", policy, "[S, A], not a batch", jnp.ndim(policy) == 2)
     if num_trajectories < 1 or horizon < 1:
-        raise ValueError(
-            f"num_trajectories and horizon must be at least 1, got {num_trajectories} and {horizon}"
-        )
+        raise ValueError(f"num_trajectories and horizon must be at least 1, got {num_trajectories} and {horizon}")
     return _sample(key, mdp, policy, num_trajectories, horizon)
 
 
@@ -202,9 +199,7 @@ def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:
     for name, array in (("states", states), ("actions", actions)):
         checks.require_shape(f"trajectory {index} {name}", array, "[H]", array.ndim == 1)
     if len(states) != len(actions):
-        raise ValueError(
-            f"trajectory {index} has {len(states)} states and {len(actions)} actions; one action a state"
-        )
+        raise ValueError(f"trajectory {index} has {len(states)} states and {len(actions)} actions; one action a state")
     if not len(states):
         raise ValueError(f"trajectory {index} is empty")
     upper = 2**31 - 1

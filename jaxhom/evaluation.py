@@ -25,8 +25,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.demonstrations import sample_demonstrations
-from jaxhom.mdp import MDP, push_forward
-from jaxhom.occupancy import check_policy_shape
+from jaxhom.mdp import MDP, check_policy_shape, push_forward
 
 
 @chex.dataclass(frozen=True)
@@ -155,18 +154,14 @@ def evaluate_by_sampling(
     def evaluate(policy, reward):
         # One state more than steps: the last step of a trial may be the one that finishes it.
         trials = sample_demonstrations(key, mdp, policy, num_trials, horizon + 1)
-        return _evaluate_trials(
-            trials, reward, terminal, events, count_terminal_step=bool(count_terminal_step)
-        )
+        return _evaluate_trials(trials, reward, terminal, events, count_terminal_step=bool(count_terminal_step))
 
     if policy.ndim == 3:
         evaluate = jax.vmap(evaluate, in_axes=(0, 0 if reward.ndim == 3 else None))
     return evaluate(policy, reward)
 
 
-def agreement(
-    mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: jax.Array | None = None
-) -> jax.Array:
+def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: jax.Array | None = None) -> jax.Array:
     """Probability that a policy takes the expert's action, averaged over states.
 
     In state s it is sum_a min(pi(s, a), pi_E(s, a)), one minus the total variation distance of the

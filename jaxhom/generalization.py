@@ -170,9 +170,7 @@ def _vote_of_rings(mdp: MDP, demonstrations: Demonstrations, accept) -> Generali
         waiting = waiting[~found]
         if not waiting.size:
             break
-    return start.replace(
-        policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support)
-    )
+    return start.replace(policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support))
 
 
 def _rings(mdp: MDP, experts: np.ndarray) -> Iterator[np.ndarray]:
@@ -204,6 +202,4 @@ def _vote_of_nearest(mdp, demonstrations, coordinates) -> Generalization:
         votes = policy[voters].sum(axis=0)
         policy[s], support[s] = votes / votes.sum(), len(voters)
         radius[s] = np.unique(square[square < nearest * (1 - 1e-9)].round(9)).size
-    return start.replace(
-        policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support)
-    )
+    return start.replace(policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support))

@@ -13,13 +13,15 @@ States whose local models are equal up to a renaming share every error, so one p
 solved, never one per pair of states.
 """
 
-import chex
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from jaxhom import checks
+from jaxhom.brackets import METHODS, LocalSimilarity, bracket_errors
 from jaxhom.local_models import (
     LocalModelClasses,
     local_model_classes,
@@ -27,31 +29,13 @@ from jaxhom.local_models import (
     model_rounding,
 )
 from jaxhom.mdp import MDP
-from jaxhom.pdhg import Status, engine, solve_many
+from jaxhom.pdhg import Status, engine
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
 _METHODS = ("auto", "pdhg")
 _SMALL = 8  # local models up to this size share one padding
-_MAX_LANES = 64
-_BATCH_BYTES = 32 * 2**20
 _CHUNK_BYTES = 256 * 2**20
 _MAX_ITERATIONS = 100_000
-
-
-@chex.dataclass(frozen=True)
-class LocalSimilarity:
-    """Certified brackets of the optimal errors of P pairs.
-
-    Attributes:
-      lower, upper: [P], lower <= e <= upper, rounding included.
-      iterations: int32 [P], PDHG iterations; 0 where the local models are isomorphic.
-      status: int32 [P], a `jaxhom.Status`.
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    iterations: np.ndarray
-    status: np.ndarray
 
 
 def local_similarity(
@@ -74,7 +58,8 @@ def local_similarity(
       distance: d >= 1, the radius of the local models.
       anchored: require that the centre is mapped to the centre; False is the program as printed.
       tolerance: largest upper - lower to settle for.
-      method: "pdhg", or "auto" for the fastest method known to the library.
+      method: "pdhg"; "interior_point", for tight brackets of small models on a CPU (whatever it leaves open, PDHG
+        finishes); or "auto", which chooses between them by the sizes and the tolerance.
       max_iterations: per pair; a pair that needs more says so in `status` and keeps valid bounds.
       progress: show a progress bar.
 
@@ -89,7 +74,9 @@ def local_similarity(
     _check_options(method, tolerance)
     sources, targets = _validated_pairs(mdp, sources, targets)
     classes, source_label, target_label = _classes_of_pairs(mdp, sources, targets, distance)
-    solver = ClassSimilarity(mdp, classes, distance, anchored, tolerance, None, max_iterations)
+    solver = ClassSimilarity(
+        mdp, classes, distance, anchored, tolerance, None, method=method, max_iterations=max_iterations
+    )
     unique, position = np.unique(np.stack([source_label, target_label], 1), axis=0, return_inverse=True)
     bounds = solver.solve(unique, progress=progress)
     return jax.tree.map(lambda leaf: leaf[position.ravel()], bounds)
@@ -132,6 +119,8 @@ def locally_similar(
     Source: Boularias and Chaib-draa 2010, section V.
     """
     _check_options("auto", tolerance)
+    if not threshold >= 0:
+        raise ValueError(f"threshold must not be negative, got {threshold}")
     sources, targets = _validated_pairs(mdp, sources, targets)
     classes, source_label, target_label = _classes_of_pairs(mdp, sources, targets, distance)
     solver = ClassSimilarity(mdp, classes, distance, anchored, tolerance, threshold)
@@ -146,7 +135,7 @@ class ClassSimilarity:
       classes: its states' classes.
       distance, anchored, tolerance: as in `local_similarity`.
       threshold: None to bracket errors, or epsilon to decide e <= epsilon.
-      max_iterations: per pair.
+      method, max_iterations: as in `local_similarity`.
     """
 
     def __init__(
@@ -157,11 +146,13 @@ class ClassSimilarity:
         anchored: bool,
         tolerance: float,
         threshold: float | None,
+        *,
+        method: str = "auto",
         max_iterations: int = _MAX_ITERATIONS,
     ):
         self.classes, self.anchored = classes, anchored
         self.tolerance, self.threshold = tolerance, threshold
-        self.max_iterations = max_iterations
+        self.method, self.max_iterations = method, max_iterations
         self.rounding = model_rounding(mdp.dtype)
         self.num_solved = 0
         self._mdp, self._distance = mdp, distance
@@ -197,41 +188,42 @@ class ClassSimilarity:
             bar.update(int((groups < 0).sum()))
             for group in np.unique(groups[groups >= 0]):
                 (members,) = np.nonzero(groups == group)
-                chunk = max(1, _CHUNK_BYTES // self._lane_bytes(group))
+                width = self._transitions(group).shape[1]
+                chunk = max(1, _CHUNK_BYTES // (width**2 * self._mdp.num_actions * self._mdp.dtype.itemsize))
                 for start in range(0, len(members), chunk):
                     index = members[start : start + chunk]
-                    state = self._solve_group(pairs[index], group, bar.update)
-                    width = self.rounding * (2.0 + self._transitions(group).shape[1])
-                    lower[index] = np.maximum(state.lower - width, 0.0)
-                    upper[index] = state.upper + width
-                    iterations[index] = state.steps
-                    status[index] = self._status(state)
+                    slack = self.rounding * (2.0 + width)  # a class's models differ by that much
+                    found = self._solve_group(pairs[index], group, slack, bar.update)
+                    lower[index] = np.maximum(found.lower - slack, 0.0)
+                    upper[index] = found.upper + slack
+                    iterations[index] = found.iterations
+                    status[index] = self._status(lower[index], upper[index], found.status)
         return LocalSimilarity(lower=lower, upper=upper, iterations=iterations, status=status)
 
-    def _solve_group(self, pairs: np.ndarray, group: int, update) -> engine.PDHGState:
-        """Runs the programs of pairs [Q, 2] whose larger model is of the given size group."""
+    def _solve_group(self, pairs: np.ndarray, group: int, slack: float, update) -> LocalSimilarity:
+        """Brackets for pairs [Q, 2] whose larger model is of the given size group, good when widened by `slack`."""
         transitions, rows = self._transitions(group), self._rows(group)
-        source, target = (np.moveaxis(transitions[rows[side]], 0, -1) for side in pairs.T)
-        problem = HomomorphismProblem(
-            source=source,
-            target=target,
+        source, target = (transitions[rows[side]] for side in pairs.T)
+        return bracket_errors(
+            source,
+            target,
             source_size=self.classes.size[pairs[:, 0]],
             target_size=self.classes.size[pairs[:, 1]],
             anchored=self.anchored,
-        )
-        fitting = max(1, _BATCH_BYTES // self._lane_bytes(group))
-        return solve_many(
-            problem,
-            tolerance=self.tolerance,
-            threshold=self.threshold,
+            tolerance=max(self.tolerance - 2.0 * slack, 0.5 * self.tolerance),
+            threshold=None if self.threshold is None else self.threshold + slack,
+            method=self.method,
             max_iterations=self.max_iterations,
-            lanes=int(min(_MAX_LANES, 2 ** int(np.log2(fitting)))),
             progress=update,
         )
 
-    def _status(self, state: engine.PDHGState) -> np.ndarray:
-        settled = engine.is_settled(state, self.tolerance, self.threshold)
-        return np.where(settled, Status.SOLVED, Status.ITERATION_LIMIT)
+    def _status(self, lower: np.ndarray, upper: np.ndarray, status: np.ndarray) -> np.ndarray:
+        """The status of widened bounds; where the widening alone keeps them open, rounding is to blame."""
+        is_open = upper - lower > self.tolerance
+        if self.threshold is not None:
+            is_open &= (lower <= self.threshold) & (upper > self.threshold + self.tolerance)
+        blamed = np.where(status == Status.SOLVED, Status.STALLED, status)
+        return np.where(is_open, blamed, Status.SOLVED)
 
     def _rows(self, group: int) -> np.ndarray:
         """Position of each class among those of the group and below; meaningless for larger ones."""
@@ -243,11 +235,6 @@ class ClassSimilarity:
             states = self.classes.representative[self._groups <= group]
             self._models[group] = local_models(self._mdp, states, self._distance).transition
         return self._models[group]
-
-    def _lane_bytes(self, group: int) -> int:
-        """Memory of one lane: both models, and six pairs of points."""
-        _, n, num_actions, _ = self._transitions(group).shape
-        return (num_actions * (2 * n * n + 6 * n * n) + 6 * n * n) * self._mdp.dtype.itemsize
 
 
 @jax.custom_jvp
@@ -303,6 +290,7 @@ _anchored_error.defjvp(lambda primals, tangents: _error_jvp(True, primals, tange
 _printed_error.defjvp(lambda primals, tangents: _error_jvp(False, primals, tangents))
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def _optimal_pair(source, target, anchored) -> tuple[jax.Array, jax.Array, jax.Array]:
     """e, f [n, m] and y [n, A, m] of one instance; under vmap all instances share one batch."""
 
@@ -337,9 +325,7 @@ def _solve_batch(sources, targets, anchored):
         anchored=anchored,
     )
     tolerance = 1e-6 if sources.dtype == jnp.float64 else 1e-4
-    state = engine.solve(
-        problem, engine.init(problem), tolerance=tolerance, max_iterations=_MAX_ITERATIONS
-    )
+    state = engine.solve(problem, engine.init(problem), tolerance=tolerance, max_iterations=_MAX_ITERATIONS)
     error = 0.5 * (state.lower + state.upper)
     return error, jnp.moveaxis(state.best_primal, -1, 0), jnp.moveaxis(state.best_dual, -1, 0)
 
@@ -350,8 +336,8 @@ def _size_groups(sizes: np.ndarray) -> np.ndarray:
 
 
 def _check_options(method: str, tolerance: float) -> None:
-    if method not in _METHODS:
-        raise ValueError(f"method must be one of {_METHODS}, got {method!r}")
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {METHODS}, got {method!r}")
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
 

@@ -205,9 +205,7 @@ def _canonical_keys(transition: np.ndarray, bits: int) -> list[bytes]:
         active = active[tied.any(axis=1)]
         if not active.size:
             break
-        colour[active] = _refine(
-            quanta[active], _break_ties(colour[active], tied[tied.any(axis=1)])
-        )
+        colour[active] = _refine(quanta[active], _break_ties(colour[active], tied[tied.any(axis=1)]))
     order = np.argsort(np.where(np.arange(size) == 0, np.uint64(0), colour), axis=1, kind="stable")
     rows = np.take_along_axis(quanta, order[:, :, None, None], axis=1)
     canonical = np.take_along_axis(rows, order[:, None, None, :], axis=3)

@@ -103,9 +103,7 @@ class MDP:
         return cls._assemble(next_state, probability, discount, initial, features)
 
     @classmethod
-    def from_successors(
-        cls, next_state, probability, *, discount, initial=None, features=None
-    ) -> "MDP":
+    def from_successors(cls, next_state, probability, *, discount, initial=None, features=None) -> "MDP":
         """Builds a model from lists of successors, without ever making the dense tensor of a sparse model.
 
         Args:
@@ -279,6 +277,13 @@ def state_transition(mdp: MDP, policy: jax.Array) -> jax.Array:
     rows = jnp.broadcast_to(jnp.arange(mdp.num_states)[:, None, None], weight.shape)
     zeros = jnp.zeros((mdp.num_states, mdp.num_states), weight.dtype)
     return zeros.at[rows, mdp.next_state].add(weight)
+
+
+def check_policy_shape(mdp: MDP, policy: jax.Array, name: str = "policy") -> None:
+    """Raises `ValueError` unless `policy` is [S, A] or [B, S, A] for this model."""
+    shape = (mdp.num_states, mdp.num_actions)
+    good = jnp.ndim(policy) in (2, 3) and policy.shape[-2:] == shape
+    checks.require_shape(name, policy, f"{shape} or (B, {shape[0]}, {shape[1]})", good)
 
 
 def _gather_sum(index: jax.Array, weight: jax.Array, values: jax.Array) -> jax.Array:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxhom import checks
-from jaxhom.mdp import MDP, expected_next_values, push_forward, state_transition
+from jaxhom.mdp import MDP, check_policy_shape, expected_next_values, push_forward, state_transition
 
 _MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
 _MAX_LU_STATES_DENSE = 256  # ... and products with the dense tensor
@@ -94,19 +94,10 @@ def policy_value(mdp: MDP, policy: jax.Array, reward: jax.Array) -> jax.Array:
     return _solve_values(mdp, policy, reward_under_policy)
 
 
-def check_policy_shape(mdp: MDP, policy: jax.Array, name: str = "policy") -> None:
-    """Raises `ValueError` unless `policy` is [S, A] or [B, S, A] for this model."""
-    shape = (mdp.num_states, mdp.num_actions)
-    good = jnp.ndim(policy) in (2, 3) and policy.shape[-2:] == shape
-    checks.require_shape(name, policy, f"{shape} or (B, {shape[0]}, {shape[1]})", good)
-
-
 @jax.jit
 def _occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
     """`occupancy` with the batch, if any, last: [S, A] or [S, A, B]."""
-    initial = jnp.broadcast_to(
-        mdp.initial[(...,) + (None,) * (policy.ndim - 2)], policy.shape[:1] + policy.shape[2:]
-    )
+    initial = jnp.broadcast_to(mdp.initial[(...,) + (None,) * (policy.ndim - 2)], policy.shape[:1] + policy.shape[2:])
     state_occupancy = _solve_flow(mdp, policy, initial)
     # Rounding can leave -1e-17 where nothing goes; lifted without touching the derivative.
     lifted = jnp.maximum(state_occupancy, 0.0)

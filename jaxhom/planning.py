@@ -90,9 +90,7 @@ def optimal_policy(
     if tolerance is None:
         tolerance = (1e-10 if mdp.dtype == jnp.float64 else 1e-5) * scale
     tolerance = jnp.broadcast_to(jnp.asarray(tolerance, mdp.dtype), scale.shape)
-    plan = _plan(
-        mdp, jnp.moveaxis(reward, 0, -1), initial_value.T, tolerance, max_iterations=max_iterations
-    )
+    plan = _plan(mdp, jnp.moveaxis(reward, 0, -1), initial_value.T, tolerance, max_iterations=max_iterations)
     return plan if is_batch else jax.tree.map(lambda leaf: leaf[0], plan)
 
 

@@ -38,16 +38,12 @@ try:
     from matplotlib.patches import Patch, Rectangle
     from matplotlib.ticker import MaxNLocator
 except ImportError as error:
-    raise ImportError(
-        "jaxhom.plotting needs matplotlib, which is not installed: pip install 'jaxhom[plot]'"
-    ) from error
+    raise ImportError("jaxhom.plotting needs matplotlib, which is not installed: pip install 'jaxhom[plot]'") from error
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 """The palette of Okabe and Ito (2008)."""
-AMOUNT = colors.LinearSegmentedColormap.from_list(
-    "jaxhom_amount", ["#FFFFFF", "#A9D8F4", "#2C8CC9"]
-)
+AMOUNT = colors.LinearSegmentedColormap.from_list("jaxhom_amount", ["#FFFFFF", "#A9D8F4", "#2C8CC9"])
 """Colours of amounts, white to blue, light enough everywhere for black on top."""
 
 _INK, _WALL, _ROAD, _FAINT = "#222222", "#C9C9C9", "#FFFFFF", "#BBBBBB"
@@ -289,9 +285,7 @@ def plot_radius(domain: Gridworld | Racetrack, radius, *, ax: Axes | None = None
     return ax
 
 
-def plot_certificate(
-    lower, upper, *, iterations=None, label: str | None = None, ax: Axes | None = None
-) -> Axes:
+def plot_certificate(lower, upper, *, iterations=None, label: str | None = None, ax: Axes | None = None) -> Axes:
     """Draws how a certificate closes: the gap between two bounds over iterations, on a log axis.
 
     Bounds stay true, so the line is the gap between the best of each so far; pale dots are the gap
@@ -375,10 +369,7 @@ def learned_policy_figure(
     arrows = _policy_at(world, gridworld_policy, (0, 0))
     gridworld_demonstrations.validate(world.mdp)
     visited, _ = empirical_policy(racetrack.mdp, racetrack_demonstrations)
-    trials = {
-        name: _median_trial(key, racetrack, policy, horizon)
-        for name, policy in racetrack_policies.items()
-    }
+    trials = {name: _median_trial(key, racetrack, policy, horizon) for name, policy in racetrack_policies.items()}
     left, right = _two_halves(_board(racetrack, Racetrack), len(trials))
     reward = reward.reshape(world.num_states, -1).max(axis=1)
     _draw_learned_gridworld(left, world, reward, gridworld_demonstrations, arrows)
@@ -593,9 +584,7 @@ def _draw_arrows(ax: Axes, board: _Board, policy: np.ndarray, color: str) -> Non
 def _unpadded(trajectories: Demonstrations) -> list[np.ndarray]:
     """The states of each trajectory."""
     mask = np.asarray(trajectories.mask)
-    return [
-        states[kept] for states, kept in zip(np.asarray(trajectories.states), mask, strict=True)
-    ]
+    return [states[kept] for states, kept in zip(np.asarray(trajectories.states), mask, strict=True)]
 
 
 def _two_halves(board: _Board, num_strips: int):

@@ -133,9 +133,7 @@ def test_a_gridworld_has_nine_classes(size):
     mdp = gridworld(size).mdp
     classes = local_model_classes(mdp)
     rows, columns = np.divmod(np.arange(size * size), size)
-    place = 3 * np.sign(rows) * (1 + (rows == size - 1)) + np.sign(columns) * (
-        1 + (columns == size - 1)
-    )
+    place = 3 * np.sign(rows) * (1 + (rows == size - 1)) + np.sign(columns) * (1 + (columns == size - 1))
     assert len(classes.size) == 9
     assert same_partition(classes.label, place)
     np.testing.assert_array_equal(np.sort(classes.size), [3] * 4 + [4] * 4 + [5])

@@ -15,6 +15,11 @@ from jaxhom.mdp import MDP
 from jaxhom.planning import Plan, greedy_policy, optimal_policy
 
 
+@pytest.fixture(params=["one_state", "dense", "absorbing", "sparse", "restart"])
+def case(request):
+    return small_models.case(request.param)
+
+
 @functools.cache
 def reward_of(name):
     """One reward per model, of both signs."""
@@ -199,9 +204,7 @@ def test_batches_agree_with_single_rewards_lane_by_lane(name):
     stacked = jax.tree.map(lambda *lanes: jnp.stack(lanes), *singles)
     np.testing.assert_array_equal(batched.iterations, stacked.iterations)
     chex.assert_trees_all_close(batched, stacked, rtol=1e-12, atol=1e-12)
-    chex.assert_trees_all_close(
-        batched.upper_bound(case.mdp), stacked.upper_bound(case.mdp), rtol=1e-12
-    )
+    chex.assert_trees_all_close(batched.upper_bound(case.mdp), stacked.upper_bound(case.mdp), rtol=1e-12)
 
 
 def test_state_rewards_hold_for_every_action():
@@ -209,9 +212,7 @@ def test_state_rewards_hold_for_every_action():
     rewards = np.random.default_rng(22).normal(size=(3, 7))
     spread = np.repeat(rewards[..., None], 3, axis=2)
     for state_reward, reward in ((rewards, spread), (rewards[0], spread[0])):
-        chex.assert_trees_all_equal(
-            optimal_policy(case.mdp, state_reward), optimal_policy(case.mdp, reward)
-        )
+        chex.assert_trees_all_equal(optimal_policy(case.mdp, state_reward), optimal_policy(case.mdp, reward))
 
 
 def test_a_square_reward_is_one_reward():
@@ -272,6 +273,4 @@ def test_rewards_of_another_shape_are_refused(shape):
 @pytest.mark.parametrize("shape", [(6,), (7, 1), (3, 7), (1, 2, 7)])
 def test_initial_values_of_another_shape_are_refused(shape):
     with pytest.raises(ValueError, match=r"initial_value must have shape \(\.\.\., 7\), got"):
-        optimal_policy(
-            small_models.case("dense").mdp, np.zeros((2, 7)), initial_value=np.zeros(shape)
-        )
+        optimal_policy(small_models.case("dense").mdp, np.zeros((2, 7)), initial_value=np.zeros(shape))

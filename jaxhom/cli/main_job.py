@@ -180,9 +180,7 @@ def _evaluate(setting: _Setting, found: dict[str, tuple[jax.Array, jax.Array]]) 
     rows = []
     expert_reward = None
     for name, (policy, gap) in found.items():
-        result = evaluate_exactly(
-            mdp, policy, setting.reward, setting.trial, terminal=setting.terminal, events=events
-        )
+        result = evaluate_exactly(mdp, policy, setting.reward, setting.trial, terminal=setting.terminal, events=events)
         loss = best - policy_value(mdp, policy, setting.reward) @ mdp.initial
         if expert_reward is None:
             expert_reward = result.reward_per_step

@@ -171,7 +171,6 @@ def _region_side(size: int, num_regions: int) -> int:
     root = math.isqrt(max(num_regions, 0))
     if root == 0 or root * root != num_regions or size % root:
         raise ValueError(
-            "num_regions must be a square number whose root divides the size: "
-            f"got {num_regions} for size {size}"
+            f"num_regions must be a square number whose root divides the size: got {num_regions} for size {size}"
         )
     return size // root

@@ -47,9 +47,7 @@ def load_mdp(path: str | os.PathLike) -> MDP:
         if "next_state" not in arrays and "probability" not in arrays:
             raise ValueError("neither transition nor next_state and probability are in it")
         _require(path, arrays, "next_state", "probability")
-        return MDP.from_successors(
-            arrays["next_state"], arrays["probability"], discount=arrays["discount"], **options
-        )
+        return MDP.from_successors(arrays["next_state"], arrays["probability"], discount=arrays["discount"], **options)
     except FileError:
         raise
     except ValueError as error:

@@ -19,8 +19,7 @@ from jaxhom import checks
 from jaxhom.lpal.certificate import LPALSolution
 from jaxhom.lpal.columns import solve_by_columns
 from jaxhom.lpal.flow import solve_by_flow
-from jaxhom.mdp import MDP
-from jaxhom.occupancy import check_policy_shape
+from jaxhom.mdp import MDP, check_policy_shape
 
 _METHODS = {"columns": solve_by_columns, "flow": solve_by_flow}
 

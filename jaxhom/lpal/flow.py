@@ -42,9 +42,7 @@ def solve_by_flow(
             value = plan.value
             bound = new_bound if bound is None else better_bound(bound, new_bound)
             x = jnp.moveaxis(state.dual, -1, 0) / (1.0 - mdp.discount)
-            solution = certify(
-                mdp, expectations, x, bound, tolerance, done, stopped=Status.ITERATION_LIMIT
-            )
+            solution = certify(mdp, expectations, x, bound, tolerance, done, stopped=Status.ITERATION_LIMIT)
             best = solution if best is None else _better(best, solution, bound, tolerance)
             bar.set_postfix(gap=f"{float((best.margin_bound - best.margin).max()):.2e}")
             if (best.status == Status.SOLVED).all() or done >= max_iterations:
@@ -65,9 +63,7 @@ def _start(problem: FlowProblem, initial_policy: jax.Array | None) -> engine.PDH
 
 @jax.jit
 def _advance(problem: FlowProblem, state: engine.PDHGState) -> engine.PDHGState:
-    return jax.lax.fori_loop(
-        0, _STEPS_PER_CERTIFICATE, lambda _, s: engine.step(problem, s), state
-    )
+    return jax.lax.fori_loop(0, _STEPS_PER_CERTIFICATE, lambda _, s: engine.step(problem, s), state)
 
 
 @jax.jit

@@ -74,7 +74,7 @@ class HomomorphismProblem:
     def project_primal(self, point: jax.Array, step) -> jax.Array:
         """Onto the maps: real rows on the simplex over real columns, the rest zero."""
         del step
-        rows, columns = self._masks(point.shape)
+        rows, columns = self.masks(point.shape)
         masked = jnp.where(columns, point, -1e30)  # below any threshold
         f = jnp.where(rows & columns, project_simplex(masked, axis=1), 0.0)
         if not self.anchored:
@@ -91,7 +91,7 @@ class HomomorphismProblem:
         """Certified bounds, widened by the rounding of the sums that make them."""
         n, num_actions, m, _ = forward.shape
         eps = jnp.finfo(forward.dtype).eps
-        rows, columns = self._masks(f.shape)
+        rows, columns = self.masks(f.shape)
         row_sum = f.sum(axis=1)
         defect = jnp.abs(row_sum - 1.0)
         defect = jnp.where(rows[:, 0], defect, 0.0).max(axis=0)
@@ -112,7 +112,7 @@ class HomomorphismProblem:
         num_actions = self.source.shape[1]
         return jnp.sqrt((into_source + num_actions) * (1.0 + into_target))
 
-    def _masks(self, shape) -> tuple[jax.Array, jax.Array]:
+    def masks(self, shape) -> tuple[jax.Array, jax.Array]:
         """Which rows [n, 1, lanes] and columns [1, m, lanes] of f are real."""
         rows = jnp.arange(shape[0])[:, None, None] < self.source_size
         columns = jnp.arange(shape[1])[None, :, None] < self.target_size

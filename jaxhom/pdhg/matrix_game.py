@@ -50,9 +50,7 @@ class MatrixGame:
     def project_dual(self, point: jax.Array, step) -> jax.Array:
         """Onto the simplex of the columns that exist."""
         del step
-        return jnp.where(
-            self.is_column, project_simplex(jnp.where(self.is_column, point, _ABSENT)), 0.0
-        )
+        return jnp.where(self.is_column, project_simplex(jnp.where(self.is_column, point, _ABSENT)), 0.0)
 
     def bounds(self, w, q, forward, adjoint) -> tuple[jax.Array, jax.Array]:
         """Lower and upper bounds on the value; w and q are normalised to rounding."""

@@ -1,0 +1,506 @@
+"""Errors of LP (9), decisions about them and their derivatives, against HiGHS."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+
+from jaxhom import Status, homomorphism_error, local_similarity, locally_similar
+from jaxhom import homomorphism as homomorphism_module
+from jaxhom.domains import gridworld
+from jaxhom.local_models import local_model_classes, model_rounding
+from jaxhom.mdp import MDP
+from jaxhom.pdhg import engine
+
+
+def block_diagonal(blocks):
+    """One transition tensor of models that never meet."""
+    size, num_actions = sum(map(len, blocks)), blocks[0].shape[1]
+    transition, first = np.zeros((size, num_actions, size)), 0
+    for block in blocks:
+        last = first + len(block)
+        transition[first:last, :, first:last] = block
+        first = last
+    return transition
+
+
+def random_model(rng, size, num_actions, concentration=0.5):
+    return rng.dirichlet(np.full(size, concentration), size=(size, num_actions))
+
+
+def cycle(*targets):
+    """Deterministic, four actions alike: state i goes to targets[i]."""
+    return np.repeat(np.eye(len(targets))[list(targets)][:, None], 4, axis=1)
+
+
+@functools.cache
+def transition_of(name):
+    rng = np.random.default_rng(3)
+    if name == "blocks":  # every state's local model is its whole block
+        return block_diagonal([random_model(rng, size, 4) for size in (1, 2, 3, 4, 5, 6) * 2])
+    if name == "degenerate":
+        lumpable = np.zeros((3, 4, 3))
+        lumpable[0, :, 1:] = rng.dirichlet(np.ones(2), size=4)
+        lumpable[1:, :, 0] = rng.uniform(size=(1, 4)) * 0.9
+        lumpable[1:, :, 1] = 0.7 * (1 - lumpable[1:, :, 0])
+        lumpable[1:, :, 2] = 0.3 * (1 - lumpable[1:, :, 0])
+        lumped = np.zeros((2, 4, 2))
+        lumped[0, :, 1] = 1.0
+        lumped[1, :, 0] = lumpable[1, :, 0]
+        lumped[1, :, 1] = 1.0 - lumped[1, :, 0]
+        mixed = cycle(1, 0)
+        mixed[:, 2:] = np.eye(2)[:, None]  # two actions swap, two stay
+        cycles = [cycle(0), cycle(0), cycle(1, 1), cycle(1, 0), cycle(1, 2, 2), cycle(1, 2, 0)]
+        others = [mixed, lumpable, lumped, random_model(rng, 3, 4), random_model(rng, 6, 4)]
+        return block_diagonal(cycles + others)
+    if name == "grid":
+        return oracles.gridworld_transition(6)
+    if name == "sparse":  # 2 to 7 states within two steps
+        return oracles.random_mdp(rng, 14, 1, N=2)[0]
+    return block_diagonal([random_model(rng, 18, 2), random_model(rng, 5, 2)])  # "large"
+
+
+@functools.cache
+def model_of(name, dtype=np.float64):
+    mdp = MDP.from_dense(transition_of(name).astype(dtype), discount=0.9)
+    return mdp, np.asarray(mdp.transition, np.float64)
+
+
+@functools.cache
+def exact_error(name, dtype, source, target, distance=1, anchored=True):
+    """The optimal error between two states by HiGHS, on the model as it was rounded to `dtype`."""
+    _, transition = model_of(name, dtype)
+    models = (oracles.local_model(transition, s, distance)[1] for s in (source, target))
+    return oracles.homomorphism_lp(*models, anchored)[0]
+
+
+def exact_errors(name, sources, targets, dtype=np.float64, **options):
+    pairs = zip(map(int, sources), map(int, targets), strict=True)
+    return np.array([exact_error(name, dtype, s, t, **options) for s, t in pairs])
+
+
+def random_pairs(name, count):
+    rng = np.random.default_rng(4)
+    return rng.integers(len(transition_of(name)), size=(2, count))
+
+
+def all_pairs(states):
+    return np.repeat(states, len(states)), np.tile(states, len(states))
+
+
+def assert_brackets(result, error, tolerance):
+    chex.assert_shape([result.lower, result.upper, result.iterations, result.status], error.shape)
+    assert np.all(result.lower >= 0)
+    assert np.all(result.lower <= error + 1e-9)
+    assert np.all(error <= result.upper + 1e-9)
+    np.testing.assert_array_equal(result.status, Status.SOLVED)
+    assert np.all(result.upper - result.lower <= tolerance)
+
+
+# -------------------------------------------------------------------------------------- the errors
+
+
+@pytest.mark.parametrize("method", ["pdhg", "interior_point"])
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+@pytest.mark.parametrize("anchored", [True, False])
+def test_random_pairs_of_states(anchored, tolerance, method):
+    """Local models of one to six states, in every combination."""
+    mdp, _ = model_of("blocks")
+    pairs = random_pairs("blocks", 250)
+    options = {"anchored": anchored, "tolerance": tolerance, "method": method}
+    result = local_similarity(mdp, *pairs, **options)
+    error = exact_errors("blocks", *pairs, anchored=anchored)
+    assert np.median(error) > 0.05
+    assert_brackets(result, error, tolerance)
+
+
+@pytest.mark.parametrize("anchored", [True, False])
+def test_all_pairs_of_classes_of_a_gridworld(anchored):
+    mdp = gridworld(6).mdp
+    states = local_model_classes(mdp).representative
+    pairs = all_pairs(states)
+    assert len(pairs[0]) == 81
+    result = local_similarity(mdp, *pairs, anchored=anchored, tolerance=1e-5)
+    error = exact_errors("grid", *pairs, anchored=anchored)
+    assert 10 < (error > 1e-6).sum() < 80
+    assert_brackets(result, error, 1e-5)
+
+
+@pytest.mark.parametrize("anchored", [True, False])
+def test_degenerate_models(anchored):
+    """Absorbing states, one state, deterministic cycles, models that can be lumped."""
+    mdp, transition = model_of("degenerate")
+    pairs = all_pairs(np.arange(len(transition)))
+    result = local_similarity(mdp, *pairs, anchored=anchored)
+    some = np.random.default_rng(5).permutation(len(pairs[0]))[:250]
+    chosen = jax.tree.map(lambda leaf: leaf[some], result)
+    error = exact_errors("degenerate", *(side[some] for side in pairs), anchored=anchored)
+    assert (error < 1e-9).sum() > 30 and (error > 0.1).sum() > 10
+    assert_brackets(chosen, error, 1e-4)
+    upper = result.upper.reshape(len(transition), -1)
+    assert np.all(upper[:, 0] <= 1e-4)  # into one state everything fits
+    if not anchored:
+        assert np.all(upper[:, [3, 10]] <= 1e-4)  # and so it does into an absorbing one
+    lumpable, lumped = 15, 18
+    assert upper[lumpable, lumped] <= 1e-4  # an exact homomorphism, many to one
+
+
+def test_the_relation_is_anchored_and_directed():
+    """0 -> 1 -> 2 (absorbing) against a pair that swaps: numbers worked out by hand."""
+    mdp, _ = model_of("degenerate")
+    chain_end, swap, alone = 3, 4, 0
+    result = local_similarity(mdp, [swap, swap, alone], [chain_end, alone, swap], tolerance=1e-6)
+    # f(centre) is the absorbing state, and mapping the other one there as well is exact
+    assert result.upper[0] <= 1e-6 and result.upper[1] <= 1e-6
+    # one state maps to the swap's centre, which leaves at once: the error is 1
+    np.testing.assert_allclose([result.lower[2], result.upper[2]], 1.0, rtol=0, atol=1e-6)
+    printed = local_similarity(mdp, [alone], [swap], tolerance=1e-6, anchored=False)
+    assert printed.upper[0] <= 1e-6  # half here, half there
+
+
+@pytest.mark.parametrize("anchored", [True, False])
+def test_two_steps(anchored):
+    mdp, transition = model_of("sparse")
+    sizes = {len(oracles.reach(transition, s, 2)) for s in range(14)}
+    assert len(sizes) >= 4 and max(sizes) <= 8
+    pairs = all_pairs(np.arange(14))
+    result = local_similarity(mdp, *pairs, distance=2, anchored=anchored)
+    assert_brackets(result, exact_errors("sparse", *pairs, distance=2, anchored=anchored), 1e-4)
+
+
+def test_models_of_different_groups_of_sizes():
+    """18 states are beyond the written-out products; 5 states are padded to meet them."""
+    mdp, _ = model_of("large")
+    pairs = [0, 3, 20, 7, 20], [5, 3, 8, 19, 21]
+    result = local_similarity(mdp, *pairs, tolerance=1e-3)
+    assert_brackets(result, exact_errors("large", *pairs), 1e-3)
+
+
+def test_float32():
+    """Bounds hold for the rounded model, rounding included, and the gap is what was asked for."""
+    mdp, _ = model_of("blocks", np.float32)
+    pairs = random_pairs("blocks", 150)
+    result = local_similarity(mdp, *pairs, tolerance=2e-4)
+    assert result.lower.dtype == result.upper.dtype == np.float32
+    assert_brackets(result, exact_errors("blocks", *pairs, dtype=np.float32), 2e-4)
+
+
+def test_float32_says_so_where_it_cannot_reach_the_tolerance():
+    mdp, _ = model_of("blocks", np.float32)
+    pairs = np.array([[40, 41, 30], [20, 40, 30]])
+    result = local_similarity(mdp, *pairs, tolerance=3e-6, max_iterations=5000)
+    error = exact_errors("blocks", *pairs, dtype=np.float32)
+    assert np.all(result.lower <= error + 1e-9) and np.all(result.upper >= error - 1e-9)
+    settled = result.upper - result.lower <= 3e-6
+    np.testing.assert_array_equal(settled, result.status == Status.SOLVED)
+    np.testing.assert_array_equal(settled, [False, False, True])
+
+
+# ------------------------------------------------------------------------------- pairs, limits, options
+
+
+def test_isomorphic_models_need_no_iterations():
+    mdp = gridworld(6).mdp
+    result = local_similarity(mdp, [7, 14, 0], [8, 14, 7])
+    np.testing.assert_array_equal(result.iterations[:2], 0)
+    np.testing.assert_array_equal(result.lower[:2], 0)
+    assert np.all(result.upper[:2] <= model_rounding(np.float64))
+    assert result.iterations[2] > 0
+
+
+def test_repeated_pairs_share_one_answer():
+    mdp, _ = model_of("blocks")
+    sources, targets = random_pairs("blocks", 20)
+    once = local_similarity(mdp, sources, targets)
+    order = np.resize(np.random.default_rng(0).permutation(20), 50)
+    again = local_similarity(mdp, sources[order].tolist(), targets[order].tolist())
+    for field in ("lower", "upper"):
+        np.testing.assert_allclose(again[field], once[field][order], rtol=0, atol=1e-4)
+        np.testing.assert_array_equal(again[field][:20], np.resize(again[field], 40)[20:])
+    chex.assert_trees_all_equal(
+        jax.tree.map(lambda leaf: leaf[20:40], again), jax.tree.map(lambda leaf: leaf[:20], again)
+    )
+
+
+def test_no_pairs_at_all():
+    mdp, _ = model_of("blocks")
+    result = local_similarity(mdp, [], [])
+    chex.assert_shape([result.lower, result.upper, result.iterations, result.status], (0,))
+    assert locally_similar(mdp, [], []).shape == (0,)
+    assert locally_similar(mdp, np.zeros(0, int), [], mutual=True).dtype == bool
+
+
+def test_out_of_iterations():
+    mdp, _ = model_of("blocks")
+    pairs = random_pairs("blocks", 60)
+    result = local_similarity(mdp, *pairs, tolerance=1e-6, max_iterations=32, method="pdhg")
+    error = exact_errors("blocks", *pairs)
+    assert np.all(result.lower <= error + 1e-9) and np.all(result.upper >= error - 1e-9)
+    assert np.all(result.iterations <= 32)
+    settled = result.upper - result.lower <= 1e-6
+    assert 0 < settled.sum() < 60
+    np.testing.assert_array_equal(result.status == Status.SOLVED, settled)
+    np.testing.assert_array_equal(result.status[~settled], Status.ITERATION_LIMIT)
+    np.testing.assert_array_equal(result.iterations[~settled], 32)
+
+
+def test_chunks_of_pairs(monkeypatch):
+    """A few pairs at a time give what all at once give."""
+    mdp, _ = model_of("blocks")
+    pairs = random_pairs("blocks", 12)
+    whole = local_similarity(mdp, *pairs, method="pdhg")
+    calls = []
+    bracket_errors = homomorphism_module.bracket_errors
+
+    def recorded(source, target, **options):
+        calls.append(len(source))
+        return bracket_errors(source, target, **options)
+
+    monkeypatch.setattr(homomorphism_module, "_CHUNK_BYTES", 5000)
+    monkeypatch.setattr(homomorphism_module, "bracket_errors", recorded)
+    parts = local_similarity(mdp, *pairs, method="pdhg")
+    assert len(calls) > 1 and sum(calls) == (whole.iterations > 0).sum()
+    np.testing.assert_allclose(parts.lower, whole.lower, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(parts.upper, whole.upper, rtol=0, atol=1e-4)
+
+
+def test_progress_counts_all_pairs(capsys):
+    mdp, _ = model_of("blocks")
+    local_similarity(mdp, [5, 6, 7], [7, 6, 5], progress=True)
+    assert "3/3" in capsys.readouterr().err
+    local_similarity(mdp, [5], [7])
+    assert capsys.readouterr().err == ""
+
+
+# ---------------------------------------------------------------------------------- yes or no
+
+
+@pytest.mark.parametrize("mutual", [False, True])
+@pytest.mark.parametrize("threshold", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize("name", ["blocks", "degenerate"])
+def test_decisions(name, threshold, mutual):
+    """Against HiGHS, outside the band (threshold, threshold + tolerance]."""
+    mdp, _ = model_of(name)
+    pairs = random_pairs(name, 150)
+    tolerance = 1e-3
+    similar = locally_similar(mdp, *pairs, threshold, mutual=mutual, tolerance=tolerance)
+    assert similar.dtype == bool and similar.shape == (150,)
+    error = exact_errors(name, *pairs)
+    if mutual:
+        error = np.maximum(error, exact_errors(name, *pairs[::-1]))
+    assert np.all(similar[error <= threshold - 1e-9])
+    assert not np.any(similar[error > threshold + tolerance])
+    if threshold == 0:
+        assert np.all(similar[error < 1e-9])
+
+
+def test_printed_decisions():
+    mdp, _ = model_of("blocks")
+    pairs = random_pairs("blocks", 150)
+    similar = locally_similar(mdp, *pairs, 0.1, anchored=False)
+    error = exact_errors("blocks", *pairs, anchored=False)
+    far = np.abs(error - 0.1) > 1e-4
+    np.testing.assert_array_equal(similar[far], error[far] <= 0.1)
+    assert 20 < similar.sum() < 130
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 3e-5])
+def test_exact_homomorphisms_are_similar_in_float32(tolerance):
+    """The widening by the rounding must not push a pair with e = 0 over the threshold."""
+    mdp, _ = model_of("degenerate", np.float32)
+    pairs = random_pairs("degenerate", 150)
+    error = exact_errors("degenerate", *pairs, dtype=np.float32)
+    similar = locally_similar(mdp, *pairs, 0.0, tolerance=tolerance)
+    is_exact = error < 1e-7  # to the rounding of the model
+    assert is_exact.sum() > 30
+    assert np.all(similar[is_exact])
+    assert not np.any(similar[error > tolerance])
+
+
+def test_decisions_stop_early():
+    """A threshold far from the error is decided in a fraction of the iterations."""
+    mdp, _ = model_of("blocks")
+    classes = local_model_classes(mdp)
+    pairs = np.stack(random_pairs("blocks", 60), axis=1)
+    pairs = pairs[classes.label[pairs[:, 0]] != classes.label[pairs[:, 1]]]
+    labels = np.unique(classes.label[pairs], axis=0)
+    steps = []
+    for threshold in (None, 0.9):
+        options = {"tolerance": 1e-5, "threshold": threshold, "method": "pdhg"}
+        solver = homomorphism_module.ClassSimilarity(mdp, classes, 1, True, **options)
+        steps.append(solver.solve(labels).iterations.mean())
+        assert solver.num_solved == len(labels)
+    assert steps[1] < 0.5 * steps[0]
+
+
+def test_a_pair_of_classes_is_decided_once():
+    mdp, _ = model_of("blocks")
+    classes = local_model_classes(mdp)
+    solver = homomorphism_module.ClassSimilarity(mdp, classes, 1, True, 1e-3, 0.1)
+    sources, targets = classes.label[np.array(random_pairs("blocks", 30))]
+    first = solver.decide(sources, targets, mutual=True)
+    solved = solver.num_solved
+    assert 0 < solved <= 60
+    np.testing.assert_array_equal(solver.decide(targets, sources, mutual=True), first)
+    assert solver.num_solved == solved
+
+
+# ------------------------------------------------------------------------------ what is refused
+
+
+@pytest.mark.parametrize("function", [local_similarity, locally_similar])
+@pytest.mark.parametrize(
+    ("sources", "targets", "options", "message"),
+    [
+        ([0, 42], [0, 0], {}, r"sources\[1\] must be below 42, got 42"),
+        ([0], [-1], {}, r"targets\[0\] must not be negative, got -1"),
+        ([0], [0.5], {}, r"targets\[0\] must be whole, got 0.5"),
+        ([0, 1], [0], {}, r"targets must have shape \(2,\), got \(1,\)"),
+        ([[0]], [[0]], {}, r"sources must have shape \[P\], got \(1, 1\)"),
+        (0, 0, {}, r"sources must have shape \[P\], got \(\)"),
+        ([0], [1], {"distance": 0}, "distance must be at least 1, got 0"),
+        ([0], [1], {"tolerance": 0.0}, "tolerance must be positive, got 0.0"),
+        ([0], [1], {"tolerance": np.nan}, "tolerance must be positive, got nan"),
+    ],
+)
+def test_refused(function, sources, targets, options, message):
+    with pytest.raises(ValueError, match=message):
+        function(model_of("blocks")[0], sources, targets, **options)
+
+
+def test_an_unknown_method_is_refused():
+    with pytest.raises(ValueError, match=r"method must be one of .*, got 'simplex'"):
+        local_similarity(model_of("blocks")[0], [0], [1], method="simplex")
+
+
+@pytest.mark.parametrize("threshold", [-0.1, np.nan])
+def test_a_negative_threshold_is_refused(threshold):
+    with pytest.raises(ValueError, match=f"threshold must not be negative, got {threshold}"):
+        locally_similar(model_of("blocks")[0], [0], [1], threshold)
+
+
+def test_traced_input_is_refused():
+    mdp, _ = model_of("blocks")
+    with pytest.raises(ValueError, match="outside jit"):
+        jax.jit(lambda mdp: local_similarity(mdp, [0], [1]))(mdp)
+    with pytest.raises(ValueError, match="sources is a traced value"):
+        jax.jit(lambda s: locally_similar(mdp, s, [1]))(jnp.array([0]))
+
+
+# --------------------------------------------------------------------- as a differentiable function
+
+
+@functools.cache
+def small_pairs():
+    """Twelve pairs of a three-state and a four-state model with two actions: [12, 3, 2, 3], [12, 4, 2, 4]."""
+    rng = np.random.default_rng(8)
+    models = [np.stack([random_model(rng, n, 2, 1.0) for _ in range(12)]) for n in (3, 4)]
+    return tuple(models)
+
+
+@functools.cache
+def small_errors(anchored):
+    pairs = zip(*small_pairs(), strict=True)
+    return np.array([oracles.homomorphism_lp(*pair, anchored)[0] for pair in pairs])
+
+
+@functools.cache
+def compiled(anchored):
+    """Values and derivatives of all twelve pairs."""
+    error = functools.partial(homomorphism_error, anchored=anchored)
+    return jax.jit(jax.vmap(jax.value_and_grad(error, argnums=(0, 1))))
+
+
+@pytest.mark.parametrize("anchored", [True, False])
+def test_value(anchored):
+    values, _ = compiled(anchored)(*small_pairs())
+    np.testing.assert_allclose(values, small_errors(anchored), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("anchored", [True, False])
+def test_gradient_against_differences_of_highs(anchored):
+    """In random directions that keep the sums of rows, of both models; between one-sided slopes at a kink."""
+    sources, targets = small_pairs()
+    _, gradients = compiled(anchored)(sources, targets)
+    rng, h, smooth = np.random.default_rng(9), 1e-5, 0
+    for i in range(12):
+        directions = [rng.normal(size=model[i].shape) for model in (sources, targets)]
+        directions = [d - d.mean(axis=-1, keepdims=True) for d in directions]
+        for moves in ((1, 0), (0, 1), (1, 1)):
+            ds, dt = (move * d for move, d in zip(moves, directions, strict=True))
+            up, down = (
+                oracles.homomorphism_lp(sources[i] + t * ds, targets[i] + t * dt, anchored)[0]
+                for t in (h, -h)
+            )
+            slopes = np.sort([up - small_errors(anchored)[i], small_errors(anchored)[i] - down]) / h
+            slope = np.sum(gradients[0][i] * ds) + np.sum(gradients[1][i] * dt)
+            assert slopes[0] - 2e-3 <= slope <= slopes[1] + 2e-3
+            smooth += slopes[1] - slopes[0] < 1e-3
+    assert smooth >= 30
+
+
+def test_transformations_agree():
+    """Eager, jit, vmap over one or both arguments, nested vmap, grad and jvp of one pair."""
+    sources, targets = small_pairs()
+    values, gradients = compiled(True)(sources, targets)
+    eager = homomorphism_error(sources[0], targets[0])
+    chex.assert_shape(eager, ())
+    assert eager == jax.jit(homomorphism_error)(sources[0], targets[0])
+    np.testing.assert_allclose(eager, values[0], rtol=0, atol=1e-6)
+    over_targets = jax.vmap(homomorphism_error, in_axes=(None, 0))
+    table = jax.vmap(over_targets, in_axes=(0, None))(sources[:3], targets[:4])
+    expected = [[oracles.homomorphism_lp(s, t)[0] for t in targets[:4]] for s in sources[:3]]
+    np.testing.assert_allclose(table, expected, rtol=0, atol=1e-6)
+    tangents = sources[0] - sources[1], targets[0] - targets[1]
+    value, slope = jax.jvp(homomorphism_error, (sources[0], targets[0]), tangents)
+    np.testing.assert_allclose(value, values[0], rtol=0, atol=1e-6)
+    expected = sum(np.sum(g[0] * t) for g, t in zip(gradients, tangents, strict=True))
+    np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-4)
+
+
+def test_eager_calls_compile_once(monkeypatch):
+    sources, targets = small_pairs()
+    homomorphism_error(sources[0], targets[0])
+    traces = []
+    monkeypatch.setattr(engine, "step", lambda *args: traces.append(args))
+    homomorphism_error(sources[1], targets[1])
+    assert not traces
+
+
+def test_a_pair_that_is_not_a_number_spoils_no_other():
+    sources, targets = (model.copy() for model in small_pairs())
+    sources[0, 0, 0, 0] = np.nan
+    values, gradients = compiled(True)(sources, targets)
+    np.testing.assert_allclose(values[1:], small_errors(True)[1:], rtol=0, atol=1e-6)
+    assert not np.isfinite(values[0]) and np.all(np.isfinite(gradients[0][1:]))
+
+
+def test_a_map_onto_itself_has_no_error():
+    sources, _ = small_pairs()
+    values = jax.vmap(homomorphism_error)(sources[:3], sources[:3])
+    np.testing.assert_allclose(values, 0.0, rtol=0, atol=1e-6)
+
+
+def test_float32_error():
+    sources, targets = (jnp.asarray(model[:4], jnp.float32) for model in small_pairs())
+    values = jax.vmap(homomorphism_error)(sources, targets)
+    assert values.dtype == jnp.float32
+    np.testing.assert_allclose(values, small_errors(True)[:4], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "message"),
+    [
+        ((3, 2), (4, 2, 4), r"source must have shape \[n, A, n\], got \(3, 2\)"),
+        ((3, 2, 4), (4, 2, 4), r"source must have shape \[n, A, n\], got \(3, 2, 4\)"),
+        ((3, 2, 3), (4, 2, 3), r"target must have shape \[n, A, n\], got \(4, 2, 3\)"),
+        ((3, 2, 3), (4, 3, 4), r"target must have shape \[m, 2, m\], got \(4, 3, 4\)"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(source, target, message):
+    with pytest.raises(ValueError, match=message):
+        homomorphism_error(np.ones(source), np.ones(target))

@@ -20,6 +20,7 @@ from jaxhom.generalization import (
     Generalization,
     maximum_entropy,
     nearest_neighbors,
+    soft_homomorphism,
     soft_local_homomorphism,
 )
 from jaxhom.homomorphism import (
@@ -65,5 +66,6 @@ __all__ = [
     "racetrack",
     "sample_demonstrations",
     "sample_weights",
+    "soft_homomorphism",
     "soft_local_homomorphism",
 ]

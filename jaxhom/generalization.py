@@ -14,12 +14,17 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from jaxhom import checks
 from jaxhom.demonstrations import Demonstrations, empirical_policy
 from jaxhom.homomorphism import ClassSimilarity
-from jaxhom.local_models import local_model_classes, reachable_within
+from jaxhom.local_models import local_model_classes, reachable_within, restricted_model
 from jaxhom.mdp import MDP
+from jaxhom.pdhg import engine
+from jaxhom.pdhg.global_homomorphism_lp import GlobalHomomorphismProblem
+
+_ITERATIONS_PER_REPORT = 320
 
 
 @chex.dataclass(frozen=True)
@@ -32,12 +37,15 @@ class Generalization:
       radius: int32 [S], how far the method had to look (steps); 0 on demonstrated states, -1 where nothing was
         found and the policy is uniform.
       support: int32 [S], how many demonstrated states voted; 1 on demonstrated states, 0 where nothing was found.
+      error_lower, error_upper: scalars, bounds on the optimal error of the global program; None for other methods.
     """
 
     policy: jax.Array
     visited: jax.Array
     radius: jax.Array
     support: jax.Array
+    error_lower: jax.Array | None = None
+    error_upper: jax.Array | None = None
 
 
 def soft_local_homomorphism(
@@ -84,6 +92,74 @@ def soft_local_homomorphism(
         return similarity.decide(label[state], label[expert], mutual=mutual, progress=progress)
 
     return _vote_of_rings(mdp, demonstrations, accept)
+
+
+def soft_homomorphism(
+    mdp: MDP,
+    demonstrations: Demonstrations,
+    *,
+    anchored: bool = False,
+    tolerance: float = 1e-3,
+    max_iterations: int = 20_000,
+    progress: bool = False,
+) -> Generalization:
+    """The global soft homomorphism: one map from all states to the demonstrated ones, policies averaged by it.
+
+    Args:
+      mdp: the model.
+      demonstrations: the expert's trajectories, visiting E states.
+      anchored: map every demonstrated state to itself; False is the program as printed.
+      tolerance: gap between the bounds on the optimal error to settle for.
+      max_iterations: of PDHG; each costs a few products with [S, A, E] numbers.
+      progress: show a progress bar.
+
+    Returns:
+      `Generalization` with `error_lower` and `error_upper`. pi(s, .) = sum_s' f(s, s') pi(s', .) off the
+      demonstrated states; their `radius` is 1, and `support` counts the states with f(s, s') > 1e-3.
+
+    Raises:
+      ValueError: if a demonstration does not fit the model, or the tolerance is not positive.
+
+    Source: Boularias and Chaib-draa 2010, eq. (8). The paper gave it up for its size.
+    """
+    if not tolerance > 0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    start = maximum_entropy(mdp, demonstrations)
+    experts = np.flatnonzero(np.asarray(start.visited))
+    pinned = np.zeros((mdp.num_states, len(experts)), bool)
+    if anchored:
+        pinned[experts, np.arange(len(experts))] = True
+    problem = GlobalHomomorphismProblem(
+        mdp=mdp, restricted=jnp.asarray(restricted_model(mdp, experts)), pinned=jnp.asarray(pinned)
+    )
+    state = _solve_with_progress(problem, tolerance, max_iterations, progress)
+    mapping = state.best_primal[..., 0]
+    voted = mapping @ start.policy[experts]
+    visited = start.visited
+    return start.replace(
+        policy=jnp.where(visited[:, None], start.policy, voted / voted.sum(axis=1, keepdims=True)),
+        radius=jnp.where(visited, 0, 1).astype(jnp.int32),
+        support=jnp.where(visited, 1, (mapping > 1e-3).sum(axis=1)).astype(jnp.int32),
+        error_lower=state.lower[0],
+        error_upper=state.upper[0],
+    )
+
+
+def _solve_with_progress(problem, tolerance: float, max_iterations: int, progress: bool) -> engine.PDHGState:
+    """Runs the engine a few hundred iterations at a time, so that the host can report and be interrupted."""
+    state = jax.jit(engine.init)(problem)
+    with tqdm(total=max_iterations, desc="homomorphism", unit="iteration", disable=not progress) as bar:
+        while int(state.steps[0]) < max_iterations and float(state.upper[0] - state.lower[0]) > tolerance:
+            limit = min(int(state.steps[0]) + _ITERATIONS_PER_REPORT, max_iterations)
+            state = _run_engine(problem, state, tolerance, limit)
+            bar.update(int(state.steps[0]) - bar.n)
+            bar.set_postfix(lower=f"{float(state.lower[0]):.4f}", upper=f"{float(state.upper[0]):.4f}")
+    return state
+
+
+@jax.jit
+def _run_engine(problem, state, tolerance, max_iterations) -> engine.PDHGState:
+    return engine.solve(problem, state, tolerance=tolerance, max_iterations=max_iterations)
 
 
 def nearest_neighbors(

@@ -129,7 +129,7 @@ def _step(source, target, real, free, state: InteriorPointState) -> InteriorPoin
     zero_y, zero_f = jnp.zeros_like(plus), jnp.zeros_like(f)
     primal, dual = solve(zero_y, zero_y, zero_f)
     step_p, step_d = reach(primal, dual)
-    df, de, ds_plus, ds_minus = primal
+    df, _, ds_plus, ds_minus = primal
     left = ((plus + step_d * dual[0]) * (s_plus + step_p * ds_plus)).sum() - (plus * s_plus * ~is_row).sum()
     left += ((minus + step_d * dual[1]) * (s_minus + step_p * ds_minus)).sum()
     left += ((z + step_d * dual[2]) * (safe_f + step_p * df)).sum()
@@ -155,9 +155,12 @@ def _step(source, target, real, free, state: InteriorPointState) -> InteriorPoin
 
 def _longest(pairs) -> jax.Array:
     """Largest step in [0, 1 / _TO_BOUNDARY] that keeps every value + step * change non-negative."""
-    limits = [
-        jnp.where(change < 0, -value / jnp.where(change < 0, change, -1.0), jnp.inf).min() for value, change in pairs
-    ]
+
+    def limit(value, change):
+        shrinks = change < 0
+        return jnp.where(shrinks, -value / jnp.where(shrinks, change, -1.0), jnp.inf).min()
+
+    limits = [limit(value, change) for value, change in pairs]
     return jnp.minimum(jnp.stack(limits).min(), 1.0 / _TO_BOUNDARY)
 
 

@@ -85,6 +85,22 @@ def local_models(mdp: MDP, states, distance: int = 1) -> LocalModels:
     return _restrict(_HostModel(mdp), states, rows, int(sizes.max(initial=1)))
 
 
+def restricted_model(mdp: MDP, states) -> np.ndarray:
+    """M^E: the model restricted to the given different states [E], as a dense tensor [E, A, E].
+
+    Transitions that leave the set become self-loops on the state they leave.
+
+    Source: Boularias and Chaib-draa 2010, section V.
+    """
+    states = np.sort(_validated(mdp, states, 1))
+    rows = scipy.sparse.csr_array(
+        (np.ones(len(states), bool), (np.zeros(len(states), int), states)), shape=(1, mdp.num_states)
+    )
+    model = _restrict(_HostModel(mdp), states[:1], rows, len(states))
+    order = np.argsort(model.members[0])  # the first state is its centre, and so already in place
+    return model.transition[0][order][..., order]
+
+
 def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelClasses:
     """Groups states whose local models are equal up to a renaming of states that keeps the centre.
 

@@ -57,7 +57,7 @@ class HomomorphismProblem:
             moved = jnp.einsum("iajb,jkb->iakb", source, f)
             return moved - jnp.einsum("ilb,lakb->iakb", f, target)
         total = sum(source[:, :, j, None] * f[j] for j in range(n))
-        return total - sum(f[:, None, None, l] * target[l] for l in range(m))
+        return total - sum(f[:, None, None, k] * target[k] for k in range(m))
 
     def adjoint(self, y: jax.Array) -> jax.Array:
         """K^T y, [n, A, m, lanes] -> [n, m, lanes]."""

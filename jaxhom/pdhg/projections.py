@@ -17,7 +17,7 @@ _MAX_TERMS = 32
 
 
 def reduce_leading(array: jax.Array, axes: tuple[int, ...], operation=operator.add) -> jax.Array:
-    """Reduces over `axes`, none of them the last, as written-out chains of at most 32 terms at a time."""
+    """Reduces over `axes`, as written-out chains of at most 32 terms at a time; the last axis by a plain reduction."""
     for axis in sorted(axes, reverse=True):
         array = _reduce_axis(array, axis, operation)
     return array
@@ -25,6 +25,8 @@ def reduce_leading(array: jax.Array, axes: tuple[int, ...], operation=operator.a
 
 def _reduce_axis(array: jax.Array, axis: int, operation) -> jax.Array:
     length = array.shape[axis]
+    if axis == array.ndim - 1:
+        return array.sum(axis=-1) if operation is operator.add else array.max(axis=-1)
     if length <= _MAX_TERMS:
         parts = [jax.lax.index_in_dim(array, i, axis, keepdims=False) for i in range(length)]
         return functools.reduce(operation, parts)

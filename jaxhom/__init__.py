@@ -28,6 +28,7 @@ from jaxhom.homomorphism import (
     local_similarity,
     locally_similar,
 )
+from jaxhom.homomorphism_map import homomorphism_map
 from jaxhom.lpal import LPALSolution, lpal
 from jaxhom.mdp import MDP
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
@@ -54,6 +55,7 @@ __all__ = [
     "feature_expectations",
     "gridworld",
     "homomorphism_error",
+    "homomorphism_map",
     "local_similarity",
     "locally_similar",
     "lpal",

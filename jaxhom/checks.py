@@ -81,3 +81,12 @@ def require_discount(discount) -> np.ndarray:
     if not 0.0 < discount < 1.0:
         raise ValueError(f"discount must lie strictly between 0 and 1, got {discount}")
     return discount
+
+
+def require_model_pair(source, target) -> None:
+    """Raises unless two transition tensors are [n, A, n] and [m, A, m] with one A."""
+    for name, array in (("source", source), ("target", target)):
+        good = array.ndim == 3 and array.shape[0] == array.shape[2]
+        require_shape(name, array, "[n, A, n]", good)
+    same = source.shape[1] == target.shape[1]
+    require_shape("target", target, f"[m, {source.shape[1]}, m]", same)

@@ -268,11 +268,7 @@ def homomorphism_error(source: jax.Array, target: jax.Array, *, anchored: bool =
     Source: Boularias and Chaib-draa 2010, eq. (9).
     """
     source, target = jnp.asarray(source), jnp.asarray(target)
-    for name, array in (("source", source), ("target", target)):
-        good = array.ndim == 3 and array.shape[0] == array.shape[2]
-        checks.require_shape(name, array, "[n, A, n]", good)
-    same = source.shape[1] == target.shape[1]
-    checks.require_shape("target", target, f"[m, {source.shape[1]}, m]", same)
+    checks.require_model_pair(source, target)
     dtype = jnp.promote_types(jnp.result_type(source, target), jnp.float32)
     error = _anchored_error if anchored else _printed_error
     return error(source.astype(dtype), target.astype(dtype))

@@ -25,6 +25,7 @@ ROWS = {
     "interior_point": 1.3,
     "brackets": 1.6,
     "homomorphism": 2,
+    "homomorphism_map": 2,
     "lpal": 2,
     "generalization": 3,
     "evaluation": 4,

@@ -1,4 +1,8 @@
-"""Errors of LP (9), decisions about them and their derivatives, against HiGHS."""
+"""Errors of LP (9), decisions about them and their derivatives, against HiGHS.
+
+Most models here have four actions and at least one local model of six states, and every call meets one of those:
+each size of the larger model in a call is a program to compile.
+"""
 
 import functools
 
@@ -58,10 +62,14 @@ def transition_of(name):
         others = [mixed, lumpable, lumped, random_model(rng, 3, 4), random_model(rng, 6, 4)]
         return block_diagonal(cycles + others)
     if name == "grid":
-        return oracles.gridworld_transition(6)
-    if name == "sparse":  # 2 to 7 states within two steps
-        return oracles.random_mdp(rng, 14, 1, N=2)[0]
-    return block_diagonal([random_model(rng, 18, 2), random_model(rng, 5, 2)])  # "large"
+        return block_diagonal([oracles.gridworld_transition(6), *(random_model(rng, 6, 4) for _ in "ab")])
+    if name == "strip":  # one to six states within two steps
+        strip = np.zeros((12, 4, 12))
+        for s in range(12):
+            ahead = np.arange(s + 1, min(s + (4 if s == 0 else 3), 12)) if s < 11 else [11]
+            strip[s][:, ahead] = rng.dirichlet(np.ones(len(ahead)), size=4)
+        return strip
+    return block_diagonal([random_model(rng, 18, 1), random_model(rng, 5, 1)])  # "large"
 
 
 @functools.cache
@@ -120,10 +128,12 @@ def test_random_pairs_of_states(anchored, tolerance, method):
 
 @pytest.mark.parametrize("anchored", [True, False])
 def test_all_pairs_of_classes_of_a_gridworld(anchored):
-    mdp = gridworld(6).mdp
-    states = local_model_classes(mdp).representative
-    pairs = all_pairs(states)
-    assert len(pairs[0]) == 81
+    states = local_model_classes(gridworld(6).mdp).representative
+    sources, targets = all_pairs(states)
+    assert len(sources) == 81
+    mdp, transition = model_of("grid")
+    np.testing.assert_allclose(transition[:36, :, :36], gridworld(6).mdp.transition, rtol=0, atol=1e-15)
+    pairs = np.append(sources, 36), np.append(targets, 42)
     result = local_similarity(mdp, *pairs, anchored=anchored, tolerance=1e-5)
     error = exact_errors("grid", *pairs, anchored=anchored)
     assert 10 < (error > 1e-6).sum() < 80
@@ -149,33 +159,34 @@ def test_degenerate_models(anchored):
     assert upper[lumpable, lumped] <= 1e-4  # an exact homomorphism, many to one
 
 
-def test_the_relation_is_anchored_and_directed():
-    """0 -> 1 -> 2 (absorbing) against a pair that swaps: numbers worked out by hand."""
-    mdp, _ = model_of("degenerate")
-    chain_end, swap, alone = 3, 4, 0
-    result = local_similarity(mdp, [swap, swap, alone], [chain_end, alone, swap], tolerance=1e-6)
-    # f(centre) is the absorbing state, and mapping the other one there as well is exact
-    assert result.upper[0] <= 1e-6 and result.upper[1] <= 1e-6
-    # one state maps to the swap's centre, which leaves at once: the error is 1
-    np.testing.assert_allclose([result.lower[2], result.upper[2]], 1.0, rtol=0, atol=1e-6)
-    printed = local_similarity(mdp, [alone], [swap], tolerance=1e-6, anchored=False)
-    assert printed.upper[0] <= 1e-6  # half here, half there
+@pytest.mark.parametrize("anchored", [True, False])
+def test_errors_by_hand(anchored):
+    """A state alone, the end of 0 -> 1, 0 <-> 1; the last pair is there for its six states."""
+    mdp, transition = model_of("degenerate")
+    alone, chain, end, swap, last = 0, 2, 3, 4, len(transition) - 1
+    pairs = [swap, swap, alone, chain, last], [end, alone, swap, swap, last - 1]
+    result = local_similarity(mdp, *pairs, tolerance=1e-6, anchored=anchored)
+    # All of the swap goes to the absorbing state. Anchored, the state alone goes to the swap's centre, which
+    # leaves at once; otherwise half goes here and half there. The chain's end cannot follow the swap for ever.
+    expected = [0.0, 0.0, 1.0, 0.5, result.lower[4]] if anchored else [0.0, 0.0, 0.0, 0.0, result.lower[4]]
+    np.testing.assert_allclose(result.lower, expected, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(result.upper, expected, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("anchored", [True, False])
 def test_two_steps(anchored):
-    mdp, transition = model_of("sparse")
-    sizes = {len(oracles.reach(transition, s, 2)) for s in range(14)}
-    assert len(sizes) >= 4 and max(sizes) <= 8
-    pairs = all_pairs(np.arange(14))
+    mdp, transition = model_of("strip")
+    sizes = {len(oracles.reach(transition, s, 2)) for s in range(12)}
+    assert sizes == {1, 2, 3, 4, 5, 6}
+    pairs = all_pairs(np.arange(12))
     result = local_similarity(mdp, *pairs, distance=2, anchored=anchored)
-    assert_brackets(result, exact_errors("sparse", *pairs, distance=2, anchored=anchored), 1e-4)
+    assert_brackets(result, exact_errors("strip", *pairs, distance=2, anchored=anchored), 1e-4)
 
 
 def test_models_of_different_groups_of_sizes():
     """18 states are beyond the written-out products; 5 states are padded to meet them."""
     mdp, _ = model_of("large")
-    pairs = [0, 3, 20, 7, 20], [5, 3, 8, 19, 21]
+    pairs = [0, 3, 20, 7], [5, 3, 8, 19]
     result = local_similarity(mdp, *pairs, tolerance=1e-3)
     assert_brackets(result, exact_errors("large", *pairs), 1e-3)
 
@@ -200,12 +211,12 @@ def test_float32_says_so_where_it_cannot_reach_the_tolerance():
     np.testing.assert_array_equal(settled, [False, False, True])
 
 
-# ------------------------------------------------------------------------------- pairs, limits, options
+# ---------------------------------------------------------------------- pairs, limits, options
 
 
 def test_isomorphic_models_need_no_iterations():
-    mdp = gridworld(6).mdp
-    result = local_similarity(mdp, [7, 14, 0], [8, 14, 7])
+    mdp, _ = model_of("grid")
+    result = local_similarity(mdp, [7, 14, 36], [8, 14, 42])
     np.testing.assert_array_equal(result.iterations[:2], 0)
     np.testing.assert_array_equal(result.lower[:2], 0)
     assert np.all(result.upper[:2] <= model_rounding(np.float64))
@@ -270,9 +281,9 @@ def test_chunks_of_pairs(monkeypatch):
 
 def test_progress_counts_all_pairs(capsys):
     mdp, _ = model_of("blocks")
-    local_similarity(mdp, [5, 6, 7], [7, 6, 5], progress=True)
+    local_similarity(mdp, [40, 6, 7], [41, 6, 20], progress=True)
     assert "3/3" in capsys.readouterr().err
-    local_similarity(mdp, [5], [7])
+    local_similarity(mdp, [40], [41])
     assert capsys.readouterr().err == ""
 
 
@@ -396,10 +407,13 @@ def test_traced_input_is_refused():
 
 @functools.cache
 def small_pairs():
-    """Twelve pairs of a three-state and a four-state model with two actions: [12, 3, 2, 3], [12, 4, 2, 4]."""
+    """Models of three and of four states, [12, 3, 2, 3] and [12, 4, 2, 4]; of the last two pairs e = 0."""
     rng = np.random.default_rng(8)
-    models = [np.stack([random_model(rng, n, 2, 1.0) for _ in range(12)]) for n in (3, 4)]
-    return tuple(models)
+    sources, targets = (np.stack([random_model(rng, n, 2, 1.0) for _ in range(12)]) for n in (3, 4))
+    targets[10:] = 0.0
+    targets[10:, :3, :, :3] = sources[10:]
+    targets[10:, 3, :, 0] = 1.0
+    return sources, targets
 
 
 @functools.cache
@@ -423,7 +437,7 @@ def test_value(anchored):
 
 @pytest.mark.parametrize("anchored", [True, False])
 def test_gradient_against_differences_of_highs(anchored):
-    """In random directions that keep the sums of rows, of both models; between one-sided slopes at a kink."""
+    """In random directions that keep the sums of rows; at a kink, between the one-sided slopes."""
     sources, targets = small_pairs()
     _, gradients = compiled(anchored)(sources, targets)
     rng, h, smooth = np.random.default_rng(9), 1e-5, 0
@@ -440,19 +454,20 @@ def test_gradient_against_differences_of_highs(anchored):
             slope = np.sum(gradients[0][i] * ds) + np.sum(gradients[1][i] * dt)
             assert slopes[0] - 2e-3 <= slope <= slopes[1] + 2e-3
             smooth += slopes[1] - slopes[0] < 1e-3
-    assert smooth >= 30
+    assert smooth >= 28
 
 
 def test_transformations_agree():
-    """Eager, jit, vmap over one or both arguments, nested vmap, grad and jvp of one pair."""
+    """Eager, jit, nested vmap, each over one argument, and jvp of one pair."""
     sources, targets = small_pairs()
     values, gradients = compiled(True)(sources, targets)
     eager = homomorphism_error(sources[0], targets[0])
     chex.assert_shape(eager, ())
-    assert eager == jax.jit(homomorphism_error)(sources[0], targets[0])
+    jitted = jax.jit(homomorphism_error)(sources[0], targets[0])
+    np.testing.assert_allclose(eager, jitted, rtol=0, atol=1e-12)
     np.testing.assert_allclose(eager, values[0], rtol=0, atol=1e-6)
     over_targets = jax.vmap(homomorphism_error, in_axes=(None, 0))
-    table = jax.vmap(over_targets, in_axes=(0, None))(sources[:3], targets[:4])
+    table = jax.jit(jax.vmap(over_targets, in_axes=(0, None)))(sources[:3], targets[:4])
     expected = [[oracles.homomorphism_lp(s, t)[0] for t in targets[:4]] for s in sources[:3]]
     np.testing.assert_allclose(table, expected, rtol=0, atol=1e-6)
     tangents = sources[0] - sources[1], targets[0] - targets[1]
@@ -477,12 +492,6 @@ def test_a_pair_that_is_not_a_number_spoils_no_other():
     values, gradients = compiled(True)(sources, targets)
     np.testing.assert_allclose(values[1:], small_errors(True)[1:], rtol=0, atol=1e-6)
     assert not np.isfinite(values[0]) and np.all(np.isfinite(gradients[0][1:]))
-
-
-def test_a_map_onto_itself_has_no_error():
-    sources, _ = small_pairs()
-    values = jax.vmap(homomorphism_error)(sources[:3], sources[:3])
-    np.testing.assert_allclose(values, 0.0, rtol=0, atol=1e-6)
 
 
 def test_float32_error():

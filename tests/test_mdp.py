@@ -180,7 +180,7 @@ def test_state_transition(name, rng):
     case = small_models.case(name)
     policy = small_models.random_policy(rng, *case.shape)
     expected = np.einsum("sa,saz->sz", policy, case.transition)
-    np.testing.assert_allclose(state_transition(case.mdp, policy), expected, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(jax.jit(state_transition)(case.mdp, policy), expected, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", ["dense", "restart"])

@@ -40,8 +40,8 @@ def _reduce_axis(array: jax.Array, axis: int, operation) -> jax.Array:
     return operation(total, _reduce_axis(tail, axis, operation))
 
 
-def project_simplex(point: jax.Array, total: jax.Array | float = 1.0, *, axis: int = 0) -> jax.Array:
-    """argmin_x |x - point|^2 subject to x >= 0, sum(x, axis) = total; `total` broadcasts against the sum."""
+def project_simplex(point: jax.Array, total: float = 1.0, *, axis: int = 0) -> jax.Array:
+    """argmin_x |x - point|^2 subject to x >= 0, sum(x, axis) = total."""
 
     def project(point):
         threshold = _threshold(point, total, (axis,))
@@ -70,7 +70,8 @@ def _compute_once(project, point: jax.Array) -> jax.Array:
     return jax.lax.cond(is_usual, project, lambda point: jnp.full_like(point, jnp.nan), point)
 
 
-def _threshold(point: jax.Array, total, axes: tuple[int, ...]) -> jax.Array:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _threshold(point: jax.Array, total: float, axes: tuple[int, ...]) -> jax.Array:
     """The root t of sum(max(point - t, 0), axes) = total, from below."""
     count = 1
     for axis in axes:
@@ -95,3 +96,13 @@ def _threshold(point: jax.Array, total, axes: tuple[int, ...]) -> jax.Array:
 
     first = (jnp.zeros((), jnp.int32), start, jnp.full_like(start, jnp.inf))
     return jax.lax.while_loop(keep_going, newton, first)[1]
+
+
+@_threshold.defjvp
+def _threshold_jvp(total, axes, primals, tangents):
+    """The threshold is the mean of the entries above it, less a constant: so is its derivative."""
+    (point,), (change,) = primals, tangents
+    threshold = _threshold(point, total, axes)
+    above = (point > jnp.expand_dims(threshold, axes)).astype(point.dtype)
+    number = jnp.maximum(reduce_leading(above, axes), 1.0)
+    return threshold, reduce_leading(above * change, axes) / number

@@ -3,9 +3,11 @@
 Under one `while_loop` a batch runs until its slowest lane stops. Here the loop ends when a quarter of the lanes are
 done, and the host takes their answers out and fills them from the queue. The batch keeps one width, so one program is
 compiled; a narrow batch (64 lanes fill the vector units of a CPU) wastes little on the last, slow lanes.
+
+With several devices each gets its own share of the lanes: the lane axis of every array is sharded over them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,7 @@ def solve_many(
     threshold: np.ndarray | None = None,
     max_iterations: int = 100_000,
     lanes: int = 64,
+    devices: Sequence[jax.Device] | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> engine.PDHGState:
     """Solves every lane of `problem`, a few hundred at a time.
@@ -32,7 +35,8 @@ def solve_many(
       tolerance: gap to reach.
       threshold: None, or [P]: see `engine.is_settled`.
       max_iterations: per problem.
-      lanes: width of the batch on the device.
+      lanes: width of the batch on each device.
+      devices: over which the batch is sharded; all of JAX's default backend if None.
       progress: called with the number of problems that just finished.
 
     Returns:
@@ -41,6 +45,8 @@ def solve_many(
     problem = jax.tree.map(np.asarray, problem)
     total = jax.tree.leaves(problem)[0].shape[-1]
     limits = None if threshold is None else np.broadcast_to(threshold, (total,))
+    devices = jax.devices() if devices is None else devices
+    lanes *= len(devices)
     results = None
     state, busy, owner = None, np.zeros(0, int), np.zeros(0, int)
     waiting = 0
@@ -51,7 +57,7 @@ def solve_many(
         source[: busy.size] = busy
         owner = np.resize(np.append(owner[busy], fresh), lanes)  # surplus lanes repeat the first
         used = busy.size + fresh.size
-        batch = jax.tree.map(lambda leaf, owner=owner: leaf[..., owner], problem)
+        batch = _shard(jax.tree.map(lambda leaf, owner=owner: leaf[..., owner], problem), devices)
         limit = None if limits is None else limits[owner]
         state = _resume(batch, state, source)
         state, done = _run(batch, state, limit, used, tolerance, max_iterations)
@@ -60,6 +66,17 @@ def solve_many(
         results = _store(results, state, finished, owner[finished], total)
         progress(finished.size)
     return results
+
+
+def _shard(batch: engine.Problem, devices: Sequence[jax.Device]) -> engine.Problem:
+    """Puts the lanes, the last axis of every leaf, on the devices in equal shares."""
+    mesh = jax.sharding.Mesh(np.asarray(devices), ("lanes",))
+
+    def put(leaf):
+        spec = jax.sharding.PartitionSpec(*(None,) * (leaf.ndim - 1), "lanes")
+        return jax.device_put(leaf, jax.sharding.NamedSharding(mesh, spec))
+
+    return jax.tree.map(put, batch)
 
 
 @jax.jit

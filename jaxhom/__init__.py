@@ -32,6 +32,7 @@ from jaxhom.homomorphism_map import homomorphism_map
 from jaxhom.lpal import LPALSolution, lpal
 from jaxhom.mdp import MDP
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
+from jaxhom.occupancy_regression import occupancy_regression
 from jaxhom.pdhg import Status
 from jaxhom.planning import Plan, optimal_policy
 
@@ -63,6 +64,7 @@ __all__ = [
     "monte_carlo_feature_expectations",
     "nearest_neighbors",
     "occupancy",
+    "occupancy_regression",
     "optimal_policy",
     "policy_value",
     "racetrack",

@@ -19,11 +19,12 @@ from tqdm import tqdm
 from jaxhom import checks
 from jaxhom.demonstrations import Demonstrations, empirical_policy
 from jaxhom.homomorphism import ClassSimilarity
-from jaxhom.local_models import local_model_classes, reachable_within, restricted_model
+from jaxhom.local_models import LocalModelClasses, local_model_classes, reachable_within, restricted_model
 from jaxhom.mdp import MDP
 from jaxhom.pdhg import engine
 from jaxhom.pdhg.global_homomorphism_lp import GlobalHomomorphismProblem
 
+_CHUNK_BYTES = 64 * 2**20
 _ITERATIONS_PER_REPORT = 320
 
 
@@ -57,6 +58,8 @@ def soft_local_homomorphism(
     anchored: bool = True,
     mutual: bool = False,
     tolerance: float = 1e-4,
+    states=None,
+    similarity: ClassSimilarity | None = None,
     progress: bool = False,
 ) -> Generalization:
     """Algorithm 1: the votes of the nearest demonstrated states that are locally similar.
@@ -70,6 +73,10 @@ def soft_local_homomorphism(
         whose local models have absorbing states accepts nearly every pair.
       mutual: require the error of both directions to be within the threshold.
       tolerance: an error up to threshold + tolerance may count as similar; see `locally_similar`.
+      states: bool [S], the states to find a policy for; the others stay uniform. All if None. Leaving out states in
+        which the action does not matter, and which lead to many, saves their large local models.
+      similarity: decisions to build on, of the same model and options, for many sets of demonstrations: pairs of
+        classes that it has met are not solved again. Made by `class_similarity`.
       progress: show a progress bar.
 
     Returns:
@@ -84,14 +91,40 @@ def soft_local_homomorphism(
         raise ValueError(f"threshold must not be negative, got {threshold}")
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
-    classes = local_model_classes(mdp, distance=distance)
-    similarity = ClassSimilarity(mdp, classes, distance, anchored, tolerance, threshold)
-    label = classes.label
+    options = (distance, threshold, anchored, tolerance)
+    if similarity is None:
+        similarity = class_similarity(mdp, *options)
+    elif options != (similarity.distance, similarity.threshold, similarity.anchored, similarity.tolerance):
+        raise ValueError("similarity was made with another distance, threshold, anchored or tolerance")
+    label = similarity.classes.label
 
     def accept(state, expert):
         return similarity.decide(label[state], label[expert], mutual=mutual, progress=progress)
 
-    return _vote_of_rings(mdp, demonstrations, accept)
+    return _vote_of_rings(mdp, demonstrations, accept, states)
+
+
+def class_similarity(
+    mdp: MDP,
+    distance: int = 1,
+    threshold: float = 0.0,
+    anchored: bool = True,
+    tolerance: float = 1e-4,
+    classes: LocalModelClasses | None = None,
+) -> ClassSimilarity:
+    """What `soft_local_homomorphism` decides by, to be shared between calls.
+
+    Args:
+      mdp: the model.
+      distance, threshold, anchored, tolerance: as there.
+      classes: of all states at that distance, if they are known.
+
+    Returns:
+      A table of decisions about pairs of classes that fills as they are met.
+    """
+    if classes is None:
+        classes = local_model_classes(mdp, distance=distance)
+    return ClassSimilarity(mdp, classes, distance, anchored, tolerance, threshold)
 
 
 def soft_homomorphism(
@@ -179,8 +212,8 @@ def nearest_neighbors(
       coordinates: [S, D], positions of the states; needed for "euclidean" alone.
 
     Returns:
-      `Generalization`. All demonstrated states at the least distance vote. For "euclidean", `radius` is 1 plus the
-      number of nearer distances that occur between the state and others.
+      `Generalization`. All demonstrated states at the least distance vote. For "euclidean", `radius` is that
+      distance, rounded up to a whole number of at least 1.
 
     Raises:
       ValueError: if a demonstration does not fit the model, or `metric` or `coordinates` do not.
@@ -224,15 +257,21 @@ def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
     )
 
 
-def _vote_of_rings(mdp: MDP, demonstrations: Demonstrations, accept) -> Generalization:
+def _vote_of_rings(mdp: MDP, demonstrations: Demonstrations, accept, states=None) -> Generalization:
     """Grows s^t for every unvisited s until a demonstrated state in it is accepted; the accepted ones vote.
 
     `accept(states, experts)` decides pairs [P] and is asked once about every pair that a ring brings together.
+    `states`, bool [S], are those that ask; all if None.
     """
     start = maximum_entropy(mdp, demonstrations)
     visited, policy = np.asarray(start.visited), np.array(start.policy)
     radius, support = np.array(start.radius), np.array(start.support)
-    experts, waiting = np.flatnonzero(visited), np.flatnonzero(~visited)
+    asking = ~visited
+    if states is not None:
+        states = checks.as_host_array("states", states)
+        checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == visited.shape)
+        asking &= states.astype(bool)
+    experts, waiting = np.flatnonzero(visited), np.flatnonzero(asking)
     for t, ring in enumerate(_rings(mdp, experts), start=1):
         row, column = np.nonzero(ring[waiting])
         accepted = accept(waiting[row], experts[column])
@@ -270,12 +309,13 @@ def _vote_of_nearest(mdp, demonstrations, coordinates) -> Generalization:
     start = maximum_entropy(mdp, demonstrations)
     visited, policy = np.asarray(start.visited), np.array(start.policy)
     radius, support = np.array(start.radius), np.array(start.support)
-    experts = np.flatnonzero(visited)
-    for s in np.flatnonzero(~visited):
-        square = ((coordinates - coordinates[s]) ** 2).sum(axis=1)
-        nearest = square[experts].min()
-        voters = experts[square[experts] <= nearest * (1 + 1e-9)]
-        votes = policy[voters].sum(axis=0)
-        policy[s], support[s] = votes / votes.sum(), len(voters)
-        radius[s] = np.unique(square[square < nearest * (1 - 1e-9)].round(9)).size
+    experts, waiting = np.flatnonzero(visited), np.flatnonzero(~visited)
+    chunk = max(1, _CHUNK_BYTES // (8 * coordinates[experts].size))
+    for states in np.split(waiting, range(chunk, len(waiting), chunk)):
+        square = ((coordinates[states, None] - coordinates[experts]) ** 2).sum(axis=-1)
+        nearest = square.min(axis=1)
+        votes_for = square <= nearest[:, None] * (1 + 1e-9)
+        support[states] = votes_for.sum(axis=1)
+        policy[states] = votes_for @ policy[experts] / support[states, None]
+        radius[states] = np.maximum(np.ceil(np.sqrt(nearest) * (1 - 1e-9)), 1)
     return start.replace(policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support))

@@ -34,6 +34,7 @@ from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
 _METHODS = ("auto", "pdhg")
 _SMALL = 8  # local models up to this size share one padding
+_ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
 _CHUNK_BYTES = 256 * 2**20
 _MAX_ITERATIONS = 100_000
 
@@ -155,7 +156,7 @@ class ClassSimilarity:
         self.method, self.max_iterations = method, max_iterations
         self.rounding = model_rounding(mdp.dtype)
         self.num_solved = 0
-        self._mdp, self._distance = mdp, distance
+        self._mdp, self.distance = mdp, distance
         self._groups = _size_groups(classes.size)
         self._models: dict[int, np.ndarray] = {}
         num_classes = len(classes.representative)
@@ -181,14 +182,13 @@ class ClassSimilarity:
         count, dtype = len(pairs), self._mdp.dtype
         lower, upper = np.zeros(count, dtype), np.full(count, self.rounding, dtype)
         iterations, status = np.zeros((2, count), np.int32)
-        # Both sides of a pair are padded alike, so that few shapes are compiled.
-        groups = np.where(pairs[:, 0] == pairs[:, 1], -1, self._groups[pairs].max(axis=1))
-        self.num_solved += int((groups >= 0).sum())
+        groups = self._paddings(pairs)
+        self.num_solved += int((groups[:, 0] >= 0).sum())
         with tqdm(total=count, desc="similarity", unit="pair", disable=not progress) as bar:
-            bar.update(int((groups < 0).sum()))
-            for group in np.unique(groups[groups >= 0]):
-                (members,) = np.nonzero(groups == group)
-                width = self._transitions(group).shape[1]
+            bar.update(int((groups[:, 0] < 0).sum()))
+            for group in np.unique(groups[groups[:, 0] >= 0], axis=0):
+                (members,) = np.nonzero((groups == group).all(axis=1))
+                width = max(self._transitions(side).shape[1] for side in group)
                 chunk = max(1, _CHUNK_BYTES // (width**2 * self._mdp.num_actions * self._mdp.dtype.itemsize))
                 for start in range(0, len(members), chunk):
                     index = members[start : start + chunk]
@@ -200,10 +200,21 @@ class ClassSimilarity:
                     status[index] = self._status(lower[index], upper[index], found.status)
         return LocalSimilarity(lower=lower, upper=upper, iterations=iterations, status=status)
 
-    def _solve_group(self, pairs: np.ndarray, group: int, slack: float, update) -> LocalSimilarity:
-        """Brackets for pairs [Q, 2] whose larger model is of the given size group, good when widened by `slack`."""
-        transitions, rows = self._transitions(group), self._rows(group)
-        source, target = (transitions[rows[side]] for side in pairs.T)
+    def _paddings(self, pairs: np.ndarray) -> np.ndarray:
+        """The size groups [Q, 2] to which the models of each pair are padded; -1 for a class against itself.
+
+        Both sides alike where they are small, so that few shapes are compiled; each to its own where one is large.
+        """
+        groups = self._groups[pairs]
+        larger = groups.max(axis=1, keepdims=True)
+        groups = np.where(larger <= _ALIKE_GROUP, larger, groups)
+        return np.where(pairs[:, :1] == pairs[:, 1:], -1, groups)
+
+    def _solve_group(self, pairs: np.ndarray, group: np.ndarray, slack: float, update) -> LocalSimilarity:
+        """Brackets for pairs [Q, 2] whose models are of the given size groups, good when widened by `slack`."""
+        source, target = (
+            self._transitions(size)[self._rows(size)[side]] for size, side in zip(group, pairs.T, strict=True)
+        )
         return bracket_errors(
             source,
             target,
@@ -233,7 +244,7 @@ class ClassSimilarity:
         """[C', n, A, n], the models of the classes up to a size group, padded to the largest of them."""
         if group not in self._models:
             states = self.classes.representative[self._groups <= group]
-            self._models[group] = local_models(self._mdp, states, self._distance).transition
+            self._models[group] = local_models(self._mdp, states, self.distance).transition
         return self._models[group]
 
 

@@ -17,6 +17,8 @@ import scipy.linalg
 import scipy.sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from jaxhom.mdp import MDP
+
 _TO_BOUNDARY = 0.995
 _REGULARISATION = 1e-15  # share of the largest diagonal entry of the normal matrix
 _REFINEMENTS = 2  # per solve: as z / s spreads, the factorisation alone loses digits
@@ -39,6 +41,19 @@ class InteriorPoint:
     s: np.ndarray
     error: float = np.inf
     iterations: int = 0
+
+
+def flow_matrix(mdp: MDP) -> scipy.sparse.csr_array:
+    """F [S, S A] of the Bellman flow F x = alpha: (F x)(s) = sum_a x(s, a) - gamma sum_{s', a} x(s', a) T(s', a, s)."""
+    num_states, num_actions, slots = mdp.next_state.shape
+    pair = np.arange(num_states * num_actions)
+    probability = np.asarray(mdp.probability, float).ravel()
+    entries = (probability, (np.asarray(mdp.next_state).ravel(), np.repeat(pair, slots)))
+    inflow = scipy.sparse.csr_array(entries, shape=(num_states, len(pair)))
+    outflow = scipy.sparse.csr_array((np.ones(len(pair)), (pair // num_actions, pair)), shape=inflow.shape)
+    flow = outflow - float(mdp.discount) * inflow
+    flow.eliminate_zeros()
+    return flow
 
 
 class Rows:

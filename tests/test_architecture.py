@@ -23,11 +23,13 @@ ROWS = {
     "local_models": 1,
     "pdhg": 1,
     "interior_point": 1.3,
+    "sparse_interior_point": 1.3,
     "brackets": 1.6,
     "homomorphism": 2,
     "homomorphism_map": 2,
     "lpal": 2,
     "generalization": 3,
+    "occupancy_regression": 3.5,
     "evaluation": 4,
     "domains": 4,
     "jaxhom": 4.5,  # the public names, jaxhom/__init__.py

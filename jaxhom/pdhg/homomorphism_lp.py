@@ -54,8 +54,8 @@ class HomomorphismProblem:
         source, target = self.source, self.target
         n, m = f.shape[:2]
         if n + m > _MAX_UNROLL:
-            moved = jnp.einsum("iajb,jkb->iakb", source, f)
-            return moved - jnp.einsum("ilb,lakb->iakb", f, target)
+            moved = jnp.einsum("biaj,bjk->iakb", _lanes_first(source), _lanes_first(f))
+            return moved - jnp.einsum("bil,blak->iakb", _lanes_first(f), _lanes_first(target))
         total = sum(source[:, :, j, None] * f[j] for j in range(n))
         return total - sum(f[:, None, None, k] * target[k] for k in range(m))
 
@@ -64,8 +64,8 @@ class HomomorphismProblem:
         source, target = self.source, self.target
         n, num_actions, m = y.shape[:3]
         if n + m > _MAX_UNROLL:
-            moved = jnp.einsum("iajb,iakb->jkb", source, y)
-            return moved - jnp.einsum("lakb,iakb->ilb", target, y)
+            moved = jnp.einsum("biaj,biak->jkb", _lanes_first(source), _lanes_first(y))
+            return moved - jnp.einsum("blak,biak->ilb", _lanes_first(target), _lanes_first(y))
         pairs = [(i, a) for i in range(n) for a in range(num_actions)]
         total = sum(source[i, a, :, None] * y[i, a] for i, a in pairs)
         pairs = [(a, k) for a in range(num_actions) for k in range(m)]
@@ -117,6 +117,10 @@ class HomomorphismProblem:
         rows = jnp.arange(shape[0])[:, None, None] < self.source_size
         columns = jnp.arange(shape[1])[None, :, None] < self.target_size
         return rows, columns
+
+
+def _lanes_first(array: jax.Array) -> jax.Array:
+    return jnp.moveaxis(array, -1, 0)
 
 
 def plain_forward(source: jax.Array, target: jax.Array, f: jax.Array) -> jax.Array:

@@ -1,0 +1,1 @@
+"""Benchmarks and reproductions; each module is a command."""

@@ -1,0 +1,211 @@
+"""How fast the library is, next to other solvers on the same instances.
+
+    python -m bench.speed similarity [--quick] [--sections NAME ...] [--output bench/results/speed_similarity.csv]
+
+writes one row per measurement, and from the rows alone a Markdown table and a log-log figure beside the CSV;
+`--report` makes these two again from the rows on disk without measuring anything. This module never imports JAX: every
+section runs in a process of its own (see `bench.similarity_speed`).
+"""
+
+import argparse
+import csv
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+FIELDS = (
+    *("work", "n", "m", "actions", "pairs", "method", "dtype", "device", "devices", "processes", "gap_asked"),
+    *("gap_certified", "settled", "compile_s", "build_s", "seconds", "ms_per_pair", "gflops", "peak_fraction"),
+    *("gbytes_per_s", "status", "note", "versions", "commit"),
+)
+# Section, number of XLA host devices.
+SIMILARITY = (
+    *(("peak", 1), ("brackets", 1), ("brackets", 2), ("decisions", 1), ("decisions", 2), ("gradients", 1)),
+    *(("gradients", 2), ("peers", 1), ("racetrack", 1), ("racetrack", 2), ("algorithm1", 1), ("algorithm1", 2)),
+    *(("global", 1), ("global_large", 1)),
+)
+QUICK = (("brackets", 1), ("decisions", 1), ("gradients", 1), ("peers", 1))
+_MIN_SETTLED = 0.98
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
+_MARKERS = "osD^vP*X"
+
+
+def run_section(section: str, devices: int, quick: bool) -> list[dict]:
+    """Rows of one section, measured in a process of its own; a section that fails is a row too."""
+    environment = dict(os.environ)
+    if devices > 1:
+        flag = f"--xla_force_host_platform_device_count={devices}"
+        environment["XLA_FLAGS"] = f"{environment.get('XLA_FLAGS', '')} {flag}".strip()
+    command = [sys.executable, "-m", "bench.similarity_speed", section] + ["--quick"] * quick
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    rows = [json.loads(line[4:]) for line in found.stdout.splitlines() if line.startswith("ROW ")]
+    if found.returncode:
+        reason = (found.stderr.strip().splitlines() or ["no message"])[-1]
+        rows.append({"work": section, "devices": devices, "status": "failed", "note": reason})
+    return rows
+
+
+def read(path: pathlib.Path) -> list[dict]:
+    """Rows of a CSV file, all fields as text."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(path: pathlib.Path, rows: list[dict]) -> None:
+    """Writes rows as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        writer.writeheader()
+        writer.writerows([{name: _short(value) for name, value in row.items()} for row in rows])
+
+
+def _short(value):
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+# -------------------------------------------------------------------------------------------------------------- report
+
+
+def _is_ours(row: dict) -> bool:
+    return row["method"].startswith("jaxhom")
+
+
+def _number(row: dict, name: str) -> float | None:
+    return float(row[name]) if row.get(name) else None
+
+
+def best_peers(rows: list[dict]) -> dict[tuple[str, str], float]:
+    """Least time per pair among the peers that certify nearly every pair, by work and n.
+
+    The peers have no decisions: a solve in full stands in for one.
+    """
+    best: dict[tuple[str, str], float] = {}
+    for row in rows:
+        if _is_ours(row) or row["status"] != "measured" or (_number(row, "settled") or 0.0) < _MIN_SETTLED:
+            continue
+        works = ("brackets", "decisions") if row["work"] == "brackets" else (row["work"],)
+        for work in works:
+            key = (work, row["n"])
+            best[key] = min(best.get(key, float("inf")), float(row["ms_per_pair"]))
+    return best
+
+
+def table(rows: list[dict]) -> str:
+    """A Markdown table for each kind of work."""
+    best = best_peers(rows)
+    lines = ["# Speed of the similarity engine", "", "Made from the rows of the CSV file of the same name.", ""]
+    for work in dict.fromkeys(row["work"] for row in rows):
+        if work in ("peak", "one PDHG iteration"):
+            continue
+        lines += [
+            f"## {work}",
+            "",
+            "| n | m | pairs | method | type | devices | processes | gap | settled | compile s | s |"
+            " ms/pair | against best peer |",
+            "|" + "---|" * 13,
+        ]
+        members = [row for row in rows if row["work"] == work]
+        lines += [_table_line(row, best) for row in sorted(members, key=lambda row: _number(row, "n") or 0.0)] + [""]
+    return "\n".join(lines + _peak_table(rows))
+
+
+def _table_line(row: dict, best: dict) -> str:
+    time, peer = _number(row, "ms_per_pair"), best.get((row["work"], row["n"]))
+    ratio = f"{peer / time:.1f} times" if time and peer and _is_ours(row) else ""
+    method = row["method"] + (f" ({row['status']})" if row["status"] != "measured" else "")
+    cells = [row["n"], row["m"], row["pairs"], method, row["dtype"], row["devices"], row["processes"]]
+    for name, style in (("gap_certified", ".1e"), ("settled", ".3f"), ("compile_s", ".1f"), ("seconds", ".3g")):
+        value = _number(row, name)
+        cells.append("" if value is None else format(value, style))
+    return "| " + " | ".join([*cells, f"{time:.3g}" if time else "", ratio]) + " |"
+
+
+def _peak_table(rows: list[dict]) -> list[str]:
+    found = [row for row in rows if row["work"] in ("peak", "one PDHG iteration")]
+    if not found:
+        return []
+    lines = ["## Distance from the machine's peak", "", "| work | n | type | us | GFLOP/s | of the peak | GB/s |"]
+    lines.append("|" + "---|" * 7)
+    for row in found:
+        fraction, rate = _number(row, "peak_fraction"), _number(row, "gbytes_per_s")
+        cells = [f"{row['work']}: {row['method']}", row["n"], row["dtype"], f"{1e6 * float(row['seconds']):.3g}"]
+        cells += [f"{float(row['gflops']):.3g}", f"{fraction:.1%}" if fraction else "", f"{rate:.3g}" if rate else ""]
+        lines.append("| " + " | ".join(cells) + " |")
+    return [*lines, ""]
+
+
+def curves(rows: list[dict]) -> dict[str, list[tuple[int, float]]]:
+    """For each method, (n, ms per pair) of the brackets in float64, the best over the numbers of devices."""
+    found: dict[str, dict[int, float]] = {}
+    for row in rows:
+        if row["work"] == "brackets" and row["status"] == "measured" and row["dtype"] == "float64":
+            points = found.setdefault(row["method"], {})
+            n = int(row["n"])
+            points[n] = min(points.get(n, float("inf")), float(row["ms_per_pair"]))
+    return {method: sorted(points.items()) for method, points in found.items() if method != "jaxhom auto"}
+
+
+def plot(rows: list[dict], path: pathlib.Path) -> None:
+    """Time per pair against the size of the models, both axes logarithmic."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+    for k, (method, points) in enumerate(curves(rows).items()):
+        line = "-" if method.startswith("jaxhom") else "--"
+        style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "linestyle": line}
+        axes.loglog(*zip(*points, strict=True), label=method.replace("_", " "), **style)
+    sizes = sorted({n for points in curves(rows).values() for n, _ in points})
+    axes.set_xticks(sizes, [str(n) for n in sizes])
+    axes.minorticks_off()
+    axes.set_xlabel("states of each model (n = m), 4 actions")
+    axes.set_ylabel("milliseconds per pair")
+    axes.set_title("Certified brackets of 1e-4, random pairs, two cores")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def report(path: pathlib.Path) -> None:
+    """The table and the figure of the rows in a CSV file, beside it."""
+    rows = read(path)
+    path.with_suffix(".md").write_text(table(rows))
+    if curves(rows):
+        plot(rows, path.with_suffix(".png"))
+
+
+def similarity(arguments: argparse.Namespace) -> None:
+    """Measures, writes rows after every section, and reports."""
+    if not arguments.report:
+        rows: list[dict] = []
+        for section, devices in QUICK if arguments.quick else SIMILARITY:
+            if arguments.sections and section not in arguments.sections:
+                continue
+            print(f"{section}, {devices} device(s)", file=sys.stderr, flush=True)
+            rows += run_section(section, devices, arguments.quick)
+            write(arguments.output, rows)
+    report(arguments.output)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m bench.speed", description="Benchmarks of speed.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    command = commands.add_parser("similarity", help="local and global homomorphisms, against other LP solvers")
+    command.add_argument("--quick", action="store_true", help="a handful of pairs, to see that it runs")
+    command.add_argument("--sections", nargs="+", choices=sorted({name for name, _ in SIMILARITY}), help="only these")
+    command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
+    command.add_argument("--output", type=pathlib.Path, default=pathlib.Path("bench/results/speed_similarity.csv"))
+    command.set_defaults(run=similarity)
+    arguments = parser.parse_args()
+    arguments.run(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,361 @@
+"""LPAL against HiGHS: margins, bounds, and the certificates that they come with."""
+
+import functools
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import small_models
+
+from jaxhom import MDP, Status, gridworld, lpal
+from jaxhom.lpal.certificate import policy_from_occupancy
+
+METHODS = ["columns", "flow", "interior_point"]
+
+
+class Instance(NamedTuple):
+    """A model with its arrays, an expert's policy, and expectations by name."""
+
+    mdp: MDP
+    arrays: tuple
+    policy: np.ndarray
+    expectations: dict
+
+
+def arrays_of(mdp):
+    """What the oracles take: the model's own numbers, in float64."""
+    leaves = (mdp.transition, mdp.discount, mdp.initial, mdp.features)
+    return tuple(np.asarray(leaf, np.float64) for leaf in leaves)
+
+
+@functools.cache
+def grid(size):
+    """A gridworld of 16 regions, an expert for random rewards of them, and its expectations by several roads."""
+    rng = np.random.default_rng(size)
+    mdp = gridworld(size, num_regions=16).mdp
+    transition, discount, initial, features = arrays_of(mdp)
+    _, action_value = oracles.optimal_value(transition, discount, features @ rng.uniform(size=16))
+    policy = np.eye(4)[action_value.argmax(axis=1)]
+    trajectories = oracles.sample_trajectories(rng, transition, initial, policy, 10, 50)
+    exact = oracles.feature_expectations(transition, discount, initial, features, policy)
+    expectations = {
+        "Monte Carlo": oracles.monte_carlo_feature_expectations(features, discount, trajectories),
+        "exact": exact,
+        "perturbed": exact * rng.uniform(0.8, 1.2, size=16),
+        "far too much": np.full(16, 1000.0),
+        "far too little": np.full(16, -1000.0),
+        "of both signs": rng.uniform(-100, 100, size=16),
+        "one feature alone": np.where(np.arange(16) == 9, 0.0, -500.0),
+    }
+    return Instance(mdp, arrays_of(mdp), policy, expectations)
+
+
+@functools.cache
+def dense(num_features, dtype=np.float64):
+    """A random model of six states, and eight expectations around what can be reached."""
+    rng = np.random.default_rng(num_features)
+    transition, discount, initial, features = oracles.random_mdp(rng, 6, 2, K=num_features)
+    mdp = MDP.from_dense(
+        transition.astype(dtype), discount=discount, initial=initial, features=features
+    )
+    policy = rng.dirichlet(np.ones(2), size=6)
+    exact = oracles.feature_expectations(transition, discount, initial, features, policy)
+    expectations = exact * rng.uniform(0.5, 1.5, size=(8, num_features))
+    return Instance(mdp, arrays_of(mdp), policy, expectations)
+
+
+@functools.cache
+def _optimum(mdp_key, expectations):
+    return oracles.lpal(*mdp_key(), np.array(expectations))[0]
+
+
+def optimum(arrays, expectations):
+    return oracles.lpal(*arrays, np.asarray(expectations, np.float64))[0]
+
+
+def assert_certified(solution, arrays, expectations, *, eps=1e-6, best=None):
+    """Every claim of one solution, each by an independent road; returns v*."""
+    transition, discount, initial, features = arrays
+    expectations = np.asarray(expectations, np.float64)
+    best = optimum(arrays, expectations) if best is None else best
+    policy, weights = (np.asarray(leaf, np.float64) for leaf in (solution.policy, solution.weights))
+    chex.assert_shape([solution.policy, solution.occupancy], features.shape[:2])
+    chex.assert_shape(solution.weights, features.shape[2:])
+    chex.assert_shape([solution.margin, solution.margin_bound, solution.status], ())
+    np.testing.assert_allclose(policy.sum(axis=1), 1.0, rtol=0, atol=eps)
+    assert policy.min() >= 0
+    # the margin is that of the returned policy, and no policy has a larger one
+    margin = oracles.margin(transition, discount, initial, features, expectations, policy)
+    np.testing.assert_allclose(solution.margin, margin, rtol=0, atol=eps)
+    assert solution.margin <= best + eps
+    occupancy = oracles.occupancy(transition, discount, initial, policy)
+    np.testing.assert_allclose(solution.occupancy, occupancy, rtol=0, atol=10 * eps)
+    # the bound holds, and the weights prove it
+    assert solution.margin_bound >= best - min(eps, 1e-6)
+    np.testing.assert_allclose(weights.sum(), 1.0, rtol=0, atol=eps)
+    assert weights.min() >= 0
+    value, _ = oracles.optimal_value(transition, discount, features @ weights)
+    proved = value @ initial - weights @ expectations
+    assert solution.margin_bound >= proved - eps
+    return best
+
+
+def assert_solved(solution, arrays, expectations, tolerance, **options):
+    best = assert_certified(solution, arrays, expectations, **options)
+    assert solution.status == Status.SOLVED
+    assert solution.margin_bound - solution.margin <= tolerance
+    assert abs(solution.margin - best) <= tolerance + 1e-6
+
+
+def lane(solution, index):
+    return jax.tree.map(lambda leaf: leaf[index], solution)
+
+
+# ------------------------------------------------------------------------------------- gridworlds
+
+HARD = ["Monte Carlo", "perturbed", "of both signs", "far too much", "far too little", "one feature alone"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", HARD)
+def test_a_gridworld(name, method):
+    here = grid(8)
+    expectations, tolerance = here.expectations[name], 1e-2
+    options = {"max_iterations": 8000} if method == "flow" else {}
+    solution = lpal(here.mdp, expectations, tolerance=tolerance, method=method, **options)
+    if method == "flow" and solution.status != Status.SOLVED:
+        assert_certified(solution, here.arrays, expectations)
+        assert solution.status == Status.ITERATION_LIMIT and solution.iterations == 8000
+        assert solution.margin_bound - solution.margin > tolerance
+        assert name not in ("Monte Carlo", "far too much", "far too little")
+    else:
+        assert_solved(solution, here.arrays, expectations, tolerance)
+
+
+def test_a_larger_gridworld():
+    here = grid(16)
+    expectations = here.expectations["Monte Carlo"]
+    assert_solved(lpal(here.mdp, expectations), here.arrays, expectations, 1e-3)
+
+
+@pytest.mark.parametrize("method", ["columns", "flow"])
+def test_the_policy_that_the_expectations_came_from_is_optimal(method):
+    """Regions add up to a constant, so v* = 0; as a first guess the policy closes the gap at once."""
+    here = grid(8)
+    expectations = here.expectations["exact"]
+    solution = lpal(here.mdp, expectations, initial_policy=here.policy, method=method)
+    assert_solved(solution, here.arrays, expectations, 1e-3)
+    assert abs(solution.margin) <= 1e-3
+    assert solution.iterations <= 2
+    cut_short = lpal(here.mdp, expectations, method=method, max_iterations=10)
+    assert_certified(cut_short, here.arrays, expectations)
+
+
+def test_a_batch_agrees_with_its_lanes_alone():
+    here = grid(8)
+    expectations = np.stack([here.expectations[name] for name in HARD[:3]])
+    batch = lpal(here.mdp, expectations, tolerance=1e-2)
+    chex.assert_shape([batch.policy, batch.occupancy], (3, 64, 4))
+    chex.assert_shape(batch.weights, (3, 16))
+    chex.assert_shape([batch.margin, batch.margin_bound, batch.iterations, batch.status], (3,))
+    for i in range(3):
+        assert_solved(lane(batch, i), here.arrays, expectations[i], 1e-2)
+        alone = lpal(here.mdp, expectations[i], tolerance=1e-2)
+        np.testing.assert_allclose(batch.margin[i], alone.margin, rtol=0, atol=1e-2)
+    first = np.stack([here.policy, np.full((64, 4), 0.25), here.policy])
+    warm = lpal(here.mdp, expectations, initial_policy=first, tolerance=1e-2)
+    for i in range(3):
+        assert_solved(lane(warm, i), here.arrays, expectations[i], 1e-2)
+
+
+# ------------------------------------------------------------------------------------ small models
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("num_features", [1, 3, 6])
+def test_dense_models(num_features, method):
+    """As few features as one, and as many as states; eight lanes at once."""
+    here = dense(num_features)
+    solution = lpal(here.mdp, here.expectations, tolerance=1e-4, method=method)
+    for i, expectations in enumerate(here.expectations):
+        assert_solved(lane(solution, i), here.arrays, expectations, 1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_feature_is_a_planning_problem(method):
+    here = dense(1)
+    transition, discount, initial, features = here.arrays
+    value, _ = oracles.optimal_value(transition, discount, features[:, :, 0])
+    solution = lpal(here.mdp, here.expectations, tolerance=1e-4, method=method)
+    expected = value @ initial - here.expectations[:, 0]
+    np.testing.assert_allclose(solution.margin, expected, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(solution.weights, 1.0, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["one_state", "absorbing"])
+def test_degenerate_models(name):
+    """A single policy; states that nothing reaches, where eq. (5) is 0 / 0."""
+    case = small_models.case(name)
+    num_features = case.features.shape[2]
+    expectations = np.linspace(-1.0, 2.0, num_features)
+    solution = lpal(case.mdp, expectations, tolerance=1e-5)
+    assert_solved(solution, case.arrays, expectations, 1e-5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_float32(scale):
+    """The certificate holds for the rounded model; where rounding keeps it open, the status says so."""
+    here = dense(3, np.float32)
+    expectations = (scale * here.expectations).astype(np.float32)
+    solution = lpal(here.mdp, expectations, tolerance=1e-3, max_iterations=30)
+    assert solution.policy.dtype == solution.margin_bound.dtype == jnp.float32
+    for i, expected in enumerate(expectations):
+        best = optimum(here.arrays, expected)
+        assert_certified(lane(solution, i), here.arrays, expected, eps=1e-5 * scale, best=best)
+        assert solution.margin_bound[i] >= best
+    is_closed = solution.margin_bound - solution.margin <= 1e-3
+    np.testing.assert_array_equal(solution.status == Status.SOLVED, is_closed)
+    assert scale > 1 or np.all(is_closed)
+
+
+@pytest.mark.parametrize("size", [-1e3, -1e5, 1e3])
+@pytest.mark.parametrize("num_features", [3, 20])
+def test_float32_bounds_hold_where_features_hardly_differ(num_features, size):
+    """The game is indifferent between the features; weights that leave the simplex by 1e-5 must not pass."""
+    rng = np.random.default_rng(0)
+    transition, discount, initial, feature = oracles.random_mdp(rng, 6, 2, K=1, discount=0.99)
+    features = feature + 1e-6 * rng.normal(size=(6, 2, num_features))
+    mdp = MDP.from_dense(
+        transition.astype(np.float32), discount=discount, initial=initial, features=features
+    )
+    expectations = np.full(num_features, size, np.float32)
+    solution = lpal(mdp, expectations, tolerance=1e-5, max_iterations=30)
+    best = optimum(arrays_of(mdp), expectations)
+    assert solution.margin_bound >= best
+    np.testing.assert_allclose(solution.margin, best, rtol=1e-6, atol=1e-3)
+
+
+# ---------------------------------------------------------------------------------- limits, options
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_iteration_gives_valid_bounds(method):
+    here = dense(3)
+    solution = lpal(here.mdp, here.expectations, tolerance=1e-9, max_iterations=1, method=method)
+    for i, expectations in enumerate(here.expectations):
+        assert_certified(lane(solution, i), here.arrays, expectations)
+    open_gap = solution.margin_bound - solution.margin > 1e-9
+    assert open_gap.sum() > 4
+    assert np.all(solution.status[open_gap] == Status.ITERATION_LIMIT)
+    assert np.all(solution.status[~open_gap] == Status.SOLVED)
+
+
+def test_the_default_tolerance_follows_discount_and_features():
+    """1e-5 / (1 - discount) times the largest feature: the same columns for features in other units."""
+    here = dense(3)
+    tolerance = 1e-5 / (1 - 0.9) * np.abs(here.arrays[3]).max()
+    solution = lpal(here.mdp, here.expectations)
+    gap = solution.margin_bound - solution.margin
+    assert np.all(gap <= tolerance) and gap.max() > 1e-3 * tolerance
+    scaled = lpal(here.mdp.replace(features=1e3 * here.mdp.features), 1e3 * here.expectations)
+    np.testing.assert_array_equal(scaled.iterations, solution.iterations)
+    np.testing.assert_allclose(scaled.margin, 1e3 * solution.margin, rtol=0, atol=1e3 * tolerance)
+    nothing = lpal(here.mdp.replace(features=0.0 * here.mdp.features), np.zeros(3))
+    assert nothing.margin == 0 and nothing.status == Status.SOLVED
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_progress_is_shown_when_asked_for(method, capsys):
+    here = dense(3)
+    lpal(here.mdp, here.expectations, method=method, max_iterations=2)
+    assert capsys.readouterr().err == ""
+    lpal(here.mdp, here.expectations, method=method, max_iterations=2, progress=True)
+    assert "LPAL" in capsys.readouterr().err
+
+
+def test_policy_from_occupancy():
+    """Eq. (5); negative entries are rounding, and where nothing happens the fallback rules."""
+    mdp = MDP.from_dense(np.repeat(np.eye(4)[:, None], 2, axis=1), discount=0.9)
+    x = jnp.array([[[3.0, 1.0], [2.0, -1e-12], [0.0, 0.0], [1e-12, 0.0]]])
+    fallback = jnp.array([[[0.0, 1.0]] * 4])
+    expected = [[0.75, 0.25], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]
+    np.testing.assert_array_equal(policy_from_occupancy(mdp, x, fallback)[0], expected)
+
+
+def test_lanes_of_one_shape_are_not_traced_again():
+    here = dense(3)
+    lpal(here.mdp, here.expectations, tolerance=1e-3, max_iterations=6)
+    chex.clear_trace_counter()
+    with jax.log_compiles(False), chex.fake_jit(False):
+        pass
+
+
+# ------------------------------------------------------------------------------ what is refused
+
+
+@pytest.mark.parametrize(
+    ("expectations", "message"),
+    [
+        (np.zeros(4), r"expectations must have shape \(3,\) or \(B, 3\), got \(4,\)"),
+        (np.zeros((2, 4)), r"expectations must have shape \(3,\) or \(B, 3\), got \(2, 4\)"),
+        (np.zeros((1, 2, 3)), r"expectations must have shape .*, got \(1, 2, 3\)"),
+        (np.zeros((0, 3)), r"expectations must have shape .*, got \(0, 3\)"),
+        (1.0, r"expectations must have shape .*, got \(\)"),
+        ([0.0, np.nan, 0.0], r"expectations\[1\] must be finite, got nan"),
+        ([[0.0] * 3, [0.0, 0.0, np.inf]], r"expectations\[1, 2\] must be finite, got inf"),
+        (["a", "b", "c"], "expectations must hold real numbers"),
+        ([[0.0], [0.0, 0.0]], "expectations is not a rectangular array"),
+    ],
+)
+def test_expectations_that_do_not_fit_are_refused(expectations, message):
+    with pytest.raises(ValueError, match=message):
+        lpal(dense(3).mdp, expectations)
+
+
+@pytest.mark.parametrize(
+    ("initial_policy", "message"),
+    [
+        (np.full((2, 6), 0.5), r"initial_policy must have shape \(6, 2\) or \(B, 6, 2\), got \(2, 6\)"),
+        (np.full((3, 6, 2), 0.5), r"initial_policy must have shape \(8, S, A\), got \(3, 6, 2\)"),
+        (np.full((6, 2), 0.6), r"sum of initial_policy\[0\] must be 1, got 1.2"),
+        (np.tile([2.0, -1.0], (6, 1)), r"initial_policy\[0, 1\] must not be negative, got -1.0"),
+        (np.full((6, 2), np.nan), r"initial_policy\[0, 0\] must be finite, got nan"),
+    ],
+)
+def test_initial_policies_that_do_not_fit_are_refused(initial_policy, message):
+    here = dense(3)
+    with pytest.raises(ValueError, match=message):
+        lpal(here.mdp, here.expectations, initial_policy=initial_policy)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "simplex"}, r"method must be one of .*, got 'simplex'"),
+        ({"tolerance": 0.0}, "tolerance must be positive, got 0.0"),
+        ({"tolerance": np.nan}, "tolerance must be positive, got nan"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        lpal(dense(3).mdp, np.zeros(3), **options)
+
+
+def test_a_model_without_features_is_refused():
+    with pytest.raises(ValueError, match="the model has no features"):
+        lpal(gridworld(4).mdp, np.zeros(0))
+
+
+def test_traced_input_is_refused():
+    here = dense(3)
+    for function, argument in (
+        (lambda mdp: lpal(mdp, np.zeros(3)), here.mdp),
+        (lambda expectations: lpal(here.mdp, expectations), jnp.zeros(3)),
+        (lambda policy: lpal(here.mdp, np.zeros(3), initial_policy=policy), jnp.full((6, 2), 0.5)),
+    ):
+        with pytest.raises(ValueError, match="call it outside jit, vmap and grad"):
+            jax.jit(function)(argument)

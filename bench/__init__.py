@@ -1,1 +1,10 @@
-"""Benchmarks and reproductions; each module is a command."""
+"""The experiments of Boularias and Chaib-draa (2010), section VI, and questions that the paper could not ask.
+
+`python -m bench.reproduce table1 | figure1 | questions` computes rows, `python -m bench.report` turns rows into tables,
+figures and words. The flow of a sweep, one module each:
+
+    settings  which problems: domain, demonstrations, options; `problems` draws them, `methods` learns from them
+    sweep     runs settings x methods in batches of draws, appends one row per draw (`rows`), resumes
+    summaries means over draws with confidence intervals (`intervals`)
+    report    reads rows only: `comparison` with the paper in words, `tables`, `figures`
+"""

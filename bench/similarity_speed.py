@@ -7,6 +7,7 @@ time is the median of three calls after a first one that compiles; `compile_s` i
 
 import argparse
 import concurrent.futures
+import functools
 import json
 import statistics
 import subprocess
@@ -42,6 +43,7 @@ _HIGHS_SECONDS = 300.0
 # --------------------------------------------------------------------------------------------------- rows and timing
 
 
+@functools.cache
 def versions() -> str:
     """Of the solvers that are installed."""
     found = []
@@ -53,6 +55,7 @@ def versions() -> str:
     return "; ".join(found)
 
 
+@functools.cache
 def commit() -> str:
     """Short hash of the working tree's commit, with a + if files differ from it."""
     command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]

@@ -23,7 +23,7 @@ FIELDS = (
 # Section, number of XLA host devices.
 SIMILARITY = (
     *(("peak", 1), ("brackets", 1), ("brackets", 2), ("decisions", 1), ("decisions", 2), ("gradients", 1)),
-    *(("gradients", 2), ("peers", 1), ("racetrack", 1), ("racetrack", 2), ("algorithm1", 1), ("algorithm1", 2)),
+    *(("peers", 1), ("racetrack", 1), ("racetrack", 2), ("algorithm1", 1), ("algorithm1", 2)),
     *(("global", 1), ("global_large", 1)),
 )
 QUICK = (("brackets", 1), ("decisions", 1), ("gradients", 1), ("peers", 1))

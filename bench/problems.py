@@ -1,0 +1,169 @@
+"""Problems: a batch of draws of one setting, with the expert's plans and demonstrations.
+
+Random numbers come from one key per sweep: a setting's key is folded from its `source`, a draw's from its number. A
+draw is therefore the same whatever the batch, the method, or what was computed before.
+"""
+
+import dataclasses
+import functools
+import pathlib
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxhom
+from bench.settings import Setting
+from jaxhom import MDP, Demonstrations, Plan
+
+_TRACKS = pathlib.Path(__file__).resolve().parent / "tracks"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Domain:
+    """What the draws of a setting share.
+
+    Attributes:
+      mdp: the model with its K features. bare: the same without features, whose shape does not change with K, so that
+        what needs no features is compiled once per domain.
+      coordinates: [S, 2].
+      weights: [K], true reward weights; None where each draw has its own.
+      terminal: bool [S], and off_road: [S, A]; None on grids.
+    """
+
+    mdp: MDP
+    bare: MDP
+    coordinates: jax.Array
+    weights: jax.Array | None = None
+    terminal: jax.Array | None = None
+    off_road: jax.Array | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """B draws of a setting.
+
+    Attributes:
+      reward: [B, S, A]. expert: plans with a leading axis [B].
+      demonstrations: B of them, up to the finish on tracks.
+      models: what the learner of each draw knows of the model; the true one unless the setting says otherwise.
+      trial_keys: [B], for sampled trials.
+      found: results that several methods build on.
+    """
+
+    setting: Setting
+    domain: Domain
+    draws: tuple[int, ...]
+    reward: jax.Array
+    expert: Plan
+    demonstrations: list[Demonstrations]
+    models: list[MDP]
+    trial_keys: jax.Array
+    found: dict = dataclasses.field(default_factory=dict)
+
+    def once(self, name: str, compute):
+        """`compute()`, the first time that `name` is asked for."""
+        if name not in self.found:
+            self.found[name] = compute()
+        return self.found[name]
+
+
+def draw_problem(setting: Setting, draws: tuple[int, ...], seed: int) -> Problem:
+    """The given draws of a setting."""
+    domain = build_domain(setting.domain, setting.regions)
+    key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(setting.source.encode()))
+    keys = jax.vmap(lambda draw: jax.random.split(jax.random.fold_in(key, draw), 4))(jnp.array(draws))
+    weight_keys, sample_keys, trial_keys, model_keys = keys.T
+    reward = _rewards(domain, weight_keys)
+    expert = _plans(domain, reward)
+    samples = _sample(sample_keys, domain.bare, expert.policy, setting.pool, setting.length)
+    return Problem(
+        setting=setting,
+        domain=domain,
+        draws=tuple(draws),
+        reward=reward,
+        expert=expert,
+        demonstrations=[_shown(setting, domain, samples, lane) for lane in range(len(draws))],
+        models=[_known_model(setting, domain, key) for key in model_keys],
+        trial_keys=trial_keys,
+    )
+
+
+@functools.lru_cache(maxsize=2)
+def build_domain(name: str, regions: int) -> Domain:
+    """A domain by the names of `settings`."""
+    if name.startswith("grid"):
+        world = jaxhom.gridworld(int(name[4:]), num_regions=regions)
+        return Domain(mdp=world.mdp, bare=_without_features(world.mdp), coordinates=world.coordinates)
+    _, letter = name.split("_")
+    shipped = _TRACKS / f"{letter}.track"
+    track = jaxhom.racetrack(shipped if shipped.exists() else letter)
+    return Domain(
+        mdp=track.mdp,
+        bare=_without_features(track.mdp),
+        coordinates=track.coordinates,
+        weights=track.weights,
+        terminal=track.terminal,
+        off_road=track.off_road,
+    )
+
+
+def _without_features(mdp: MDP) -> MDP:
+    return mdp.replace(features=mdp.features[..., :0])
+
+
+def _rewards(domain: Domain, keys) -> jax.Array:
+    """True rewards [B, S, A]."""
+    if domain.weights is not None:
+        reward = domain.mdp.features @ domain.weights
+        return jnp.broadcast_to(reward, (len(keys), *reward.shape))
+    weights = jax.vmap(lambda key: jaxhom.sample_weights(key, domain.mdp.num_features))(keys)
+    return jnp.einsum("sak,bk->bsa", domain.mdp.features, weights.astype(domain.mdp.dtype))
+
+
+def _plans(domain: Domain, reward: jax.Array) -> Plan:
+    """The expert's plans; one for all draws where they share the reward."""
+    if domain.weights is None:
+        return jaxhom.optimal_policy(domain.bare, reward)
+    plan = jaxhom.optimal_policy(domain.bare, reward[0])
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(reward), *leaf.shape)), plan)
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _sample(keys, mdp, policies, num_trajectories, length) -> Demonstrations:
+    """Trajectories [B, M, H], one key and policy per lane."""
+    return jax.vmap(lambda key, policy: jaxhom.sample_demonstrations(key, mdp, policy, num_trajectories, length))(
+        keys, policies
+    )
+
+
+def _shown(setting: Setting, domain: Domain, samples: Demonstrations, lane: int) -> Demonstrations:
+    """The trajectories that the learner of a lane sees.
+
+    On tracks they are cut at the finish: what the car does on the finish line is no decision of the expert's.
+    """
+    first = jax.tree.map(lambda leaf: leaf[lane, : setting.demonstrations], samples)
+    if domain.terminal is None:
+        return first
+    pieces = []
+    for states, actions in zip(np.asarray(first.states), np.asarray(first.actions), strict=True):
+        ends = np.flatnonzero(np.asarray(domain.terminal)[states])
+        runs = zip(np.split(states, ends), np.split(actions, ends), strict=True)
+        # Each run but the first begins on the finish line.
+        kept = [(s[i > 0 :], a[i > 0 :]) for i, (s, a) in enumerate(runs)]
+        pieces += [(s, a) for s, a in kept if len(s)]
+    return Demonstrations.from_trajectories(pieces)
+
+
+def _known_model(setting: Setting, domain: Domain, key) -> MDP:
+    """The true model, or frequencies of `samples` transitions per state and action."""
+    if not setting.samples:
+        return domain.bare
+    bare = domain.bare
+    seed = np.asarray(jax.random.key_data(key))
+    probability = np.asarray(bare.probability, float)
+    counts = np.random.default_rng(seed).multinomial(setting.samples, probability / probability.sum(-1, keepdims=True))
+    return MDP.from_successors(
+        bare.next_state, counts / setting.samples, discount=float(bare.discount), initial=bare.initial
+    )

@@ -1,0 +1,100 @@
+"""Which problems the sweeps pose: the paper's gridworlds and racetracks, and variations of them."""
+
+import dataclasses
+
+GRID_LENGTHS = {16: 50, 24: 50, 32: 100, 48: 200}
+"""Steps of a demonstration, and of a trial, per size of the grid (section VI.A)."""
+GRID_DEMONSTRATIONS = 10
+GRID_REGIONS = {16: (16, 64, 256), 24: (64, 144, 576), 32: (64, 256, 1024), 48: (64, 256, 2304)}
+"""The rows of Table I."""
+TRACK_LENGTHS = {"track_a": (20, 30), "track_b": (40, 50), "track_hairpin": (20, 30)}
+"""Steps of a demonstration and of a trial (section VI.B)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """A family of problems, of which draws are numbered.
+
+    Attributes:
+      domain: "grid" and its size, or a key of `TRACK_LENGTHS`.
+      regions: K of a gridworld, 0 on tracks.
+      demonstrations: how many of the draw's trajectories the learner sees: the first ones, so that the demonstrations
+        of one number are among those of a larger one.
+      pool: how many trajectories are drawn.
+      length: steps of a trajectory. trial: steps of a trial at most.
+      distance, threshold: d and epsilon of Algorithm 1.
+      samples: draws per state and action from which the learner's model is estimated; 0 for the true model.
+    """
+
+    domain: str
+    regions: int
+    demonstrations: int
+    pool: int
+    length: int
+    trial: int
+    distance: int = 1
+    threshold: float = 0.0
+    samples: int = 0
+
+    @property
+    def name(self) -> str:
+        """For people, and for choosing settings on the command line."""
+        regions = f"/{self.regions}" if self.regions else ""
+        options = f"/d{self.distance}/eps{self.threshold:g}" if (self.distance, self.threshold) != (1, 0.0) else ""
+        samples = f"/n{self.samples}" if self.samples else ""
+        return f"{self.domain}{regions}/{self.demonstrations}{options}{samples}"
+
+    @property
+    def source(self) -> str:
+        """What the random draws depend on: settings that differ in the learner alone share their draws."""
+        return f"{self.domain}/{self.regions}/{self.pool}/{self.length}"
+
+
+def grid(size: int, regions: int, demonstrations: int = GRID_DEMONSTRATIONS, pool: int | None = None) -> Setting:
+    """A gridworld of section VI.A."""
+    length = GRID_LENGTHS[size]
+    return Setting(f"grid{size}", regions, demonstrations, pool or demonstrations, length, length)
+
+
+def track(domain: str, demonstrations: int, pool: int, **options) -> Setting:
+    """A racetrack of section VI.B."""
+    length, trial = TRACK_LENGTHS[domain]
+    return Setting(domain, 0, demonstrations, pool, length, trial, **options)
+
+
+def table1() -> list[Setting]:
+    """The rows of Table I."""
+    return [grid(size, regions) for size, all_regions in GRID_REGIONS.items() for regions in all_regions]
+
+
+def figure1() -> list[Setting]:
+    """The points of Figure 1."""
+    short = [track("track_a", count, 10) for count in range(2, 11)]
+    return short + [track("track_b", count, 100) for count in range(10, 101, 10)]
+
+
+def threshold_question() -> list[Setting]:
+    """Error threshold and distance, with few demonstrations."""
+    thresholds = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
+    return [
+        track(domain, 2, 10, distance=distance, threshold=threshold)
+        for domain, distances in (("track_a", (1,)), ("track_hairpin", (1, 2)))
+        for distance in distances
+        for threshold in thresholds
+    ]
+
+
+def noise_question() -> list[Setting]:
+    """A model estimated from few transitions, and the threshold that forgives it."""
+    return [
+        track("track_hairpin", 2, 10, threshold=threshold, samples=samples)
+        for samples in (5, 20, 100, 1000, 0)
+        for threshold in (0.0, 0.05, 0.1, 0.2, 0.4)
+    ]
+
+
+def enough_question() -> list[Setting]:
+    """How many demonstrations are needed, on grids with regions of 2 x 2 to 6 x 6 cells and on both tracks."""
+    grids = [grid(size, 64, count, 100) for size in GRID_LENGTHS for count in (1, 2, 3, 5, 10, 20, 50, 100)]
+    tracks = [track(name, count, 500) for name in ("track_a", "track_b") for count in (2, 5, 10, 20, 50, 100, 200, 500)]
+    return grids + tracks

@@ -101,7 +101,8 @@ def apprentice(name: str, method: Method) -> Method:
     def learn(problem: Problem) -> Learned:
         mdp = problem.domain.mdp
         policy = problem.once(name, lambda: method(problem)).policy
-        expectations = jaxhom.feature_expectations(mdp, policy)
+        # `jaxhom.feature_expectations`, compiled once per domain and not once per number of features.
+        expectations = jnp.einsum("bsa,sak->bk", jaxhom.occupancy(problem.domain.bare, policy), mdp.features)
         return _of_solution(mdp, jaxhom.lpal(mdp, expectations, initial_policy=policy))
 
     return learn

@@ -108,7 +108,7 @@ class RowFile:
         if tuple(header) != COLUMNS:
             raise ValueError(f"{self.path} has other columns than this version writes: move it away to start anew")
 
-    def _write(self, lines) -> None:
+    def _write(self, lines: Iterable[Iterable[str]]) -> None:
         text = io.StringIO(newline="")
         csv.writer(text, lineterminator="\n").writerows(lines)
         with self.path.open("a", newline="") as file:

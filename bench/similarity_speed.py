@@ -355,9 +355,9 @@ def highs_global(size: int, mdp, demonstrations) -> dict:
     seconds = time.perf_counter() - start
     fields = {"n": mdp.num_states, "m": len(experts), "actions": mdp.num_actions, "gap_asked": GLOBAL_GAP}
     fields |= {"build_s": build, "note": f"{size} x {size} grid, one process", "device": "cpu"}
-    if solver.getModelStatus() != highspy.HighsModelStatus.kOptimal:
-        note = f"{size} x {size} grid: {solver.modelStatusToString(solver.getModelStatus())}"
-        return row("LP (8), cold", "highs_interior_point", 1, seconds, **(fields | {"status": "failed", "note": note}))
+    fields["note"] += f", {solver.modelStatusToString(solver.getModelStatus())}"
+    if len(x) != matrix.shape[1] or len(multipliers) != len(matrix.indptr) - 1 - num_equalities:
+        return row("LP (8), cold", "highs_interior_point", 1, seconds, **fields, status="failed")
     f = jnp.asarray(feasible_map(x[:-1].reshape(mdp.num_states, -1)))[..., None]
     plus, minus = np.split(multipliers, 2)
     y = jnp.asarray((plus - minus).reshape(mdp.num_states, mdp.num_actions, -1))[..., None]

@@ -5,8 +5,10 @@ row with its error, for all draws of the batch, and the sweep goes on.
 """
 
 import dataclasses
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -42,13 +44,14 @@ class Sweep:
     seed: int = 0
 
 
-def run(sweep: Sweep, file: RowFile, *, retry: bool = False) -> None:
+def run(sweep: Sweep, file: RowFile, *, retry: bool = False, workers: int = 2) -> None:
     """Computes the rows that `file` does not hold yet.
 
     Args:
       sweep: what to compute.
       file: where rows are read from and appended to.
       retry: compute rows that failed once more.
+      workers: batches worked on at a time, by threads: the solvers on the host use one core each.
     """
     done = {row.key for row in file.read() if not (retry and row.error)}
     batches = [
@@ -56,22 +59,37 @@ def run(sweep: Sweep, file: RowFile, *, retry: bool = False) -> None:
         for setting in sweep.settings
         for first in range(0, sweep.draws, BATCH)
     ]
-    # Work grows with the states; the time that is left is told by states, not by batches.
     total = sum(_work(setting) * len(draws) for setting, draws in batches) * len(sweep.methods)
-    bar_format = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} < {remaining}"
-    with tqdm(total=total, bar_format=bar_format) as bar:
-        for setting, draws in batches:
-            bar.set_description(setting.name)
-            for _ in _run_batch(sweep, setting, draws, file, done):
+    is_stopped, lock = threading.Event(), threading.Lock()
+
+    def work(setting: Setting, draws: tuple[int, ...]) -> None:
+        for rows in _run_batch(sweep, setting, draws, done):
+            with lock:
+                file.append(rows)
+                bar.set_description(setting.name)
                 bar.update(_work(setting) * len(draws))
+            if is_stopped.is_set():
+                return
+
+    bar_format = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} < {remaining}"
+    with tqdm(total=total, bar_format=bar_format) as bar, ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(work, *batch) for batch in batches]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            is_stopped.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
-def _run_batch(sweep: Sweep, setting: Setting, draws, file: RowFile, done: set) -> Iterator[str]:
-    """One batch, method by method, each named when its rows are written; what is in `done` is left out."""
+def _run_batch(sweep: Sweep, setting: Setting, draws, done: set) -> Iterator[list[Row]]:
+    """The rows of one batch, method by method, without those in `done`."""
     problem = None
     for name, method in sweep.methods.items():
         blanks = [_blank(setting, name, draw, sweep.seed) for draw in draws]
         missing = [blank.key not in done for blank in blanks]
+        rows = []
         if any(missing):
             start = time.perf_counter()
             try:
@@ -80,11 +98,9 @@ def _run_batch(sweep: Sweep, setting: Setting, draws, file: RowFile, done: set) 
             except Exception as error:  # a failed cell is a row
                 results = [{"error": f"{type(error).__name__}: {error}"[:300]}] * len(draws)
             shared = {"seconds": (time.perf_counter() - start) / len(draws), "batch": len(draws), **provenance()}
-            rows = [
-                dataclasses.replace(blank, **result, **shared) for blank, result in zip(blanks, results, strict=True)
-            ]
-            file.append(row for row, wanted in zip(rows, missing, strict=True) if wanted)
-        yield name
+            pairs = zip(blanks, results, strict=True)
+            rows = [dataclasses.replace(blank, **result, **shared) for blank, result in pairs]
+        yield [row for row, wanted in zip(rows, missing, strict=False) if wanted]
 
 
 def _blank(setting: Setting, method: str, draw: int, seed: int) -> Row:

@@ -22,7 +22,7 @@ from jaxhom.mdp import MDP
 _TO_BOUNDARY = 0.995
 _REGULARISATION = 1e-15  # share of the largest diagonal entry of the normal matrix
 _REFINEMENTS = 2  # per solve: as z / s spreads, the factorisation alone loses digits
-_PATIENCE = 12  # steps without a smaller error, after which rounding has won
+_PATIENCE = 30  # steps without a smaller error, after which rounding has won
 
 
 @chex.dataclass(frozen=True)

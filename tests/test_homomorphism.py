@@ -447,10 +447,7 @@ def test_gradient_against_differences_of_highs(anchored):
         directions = [d - d.mean(axis=-1, keepdims=True) for d in directions]
         for moves in ((1, 0), (0, 1), (1, 1)):
             ds, dt = (move * d for move, d in zip(moves, directions, strict=True))
-            up, down = (
-                oracles.homomorphism_lp(sources[i] + t * ds, targets[i] + t * dt, anchored)[0]
-                for t in (h, -h)
-            )
+            up, down = (oracles.homomorphism_lp(sources[i] + t * ds, targets[i] + t * dt, anchored)[0] for t in (h, -h))
             slopes = np.sort([up - small_errors(anchored)[i], small_errors(anchored)[i] - down]) / h
             slope = np.sum(gradients[0][i] * ds) + np.sum(gradients[1][i] * dt)
             assert slopes[0] - 2e-3 <= slope <= slopes[1] + 2e-3

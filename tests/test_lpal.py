@@ -59,29 +59,22 @@ def dense(num_features, dtype=np.float64):
     """A random model of six states, and eight expectations around what can be reached."""
     rng = np.random.default_rng(num_features)
     transition, discount, initial, features = oracles.random_mdp(rng, 6, 2, K=num_features)
-    mdp = MDP.from_dense(
-        transition.astype(dtype), discount=discount, initial=initial, features=features
-    )
+    mdp = MDP.from_dense(transition.astype(dtype), discount=discount, initial=initial, features=features)
     policy = rng.dirichlet(np.ones(2), size=6)
     exact = oracles.feature_expectations(transition, discount, initial, features, policy)
     expectations = exact * rng.uniform(0.5, 1.5, size=(8, num_features))
     return Instance(mdp, arrays_of(mdp), policy, expectations)
 
 
-@functools.cache
-def _optimum(mdp_key, expectations):
-    return oracles.lpal(*mdp_key(), np.array(expectations))[0]
-
-
 def optimum(arrays, expectations):
     return oracles.lpal(*arrays, np.asarray(expectations, np.float64))[0]
 
 
-def assert_certified(solution, arrays, expectations, *, eps=1e-6, best=None):
-    """Every claim of one solution, each by an independent road; returns v*."""
+def assert_certified(solution, arrays, expectations, *, eps=1e-6, slack=np.inf):
+    """Every claim of one solution, each by an independent road; returns v*. `slack` is what planning may add."""
     transition, discount, initial, features = arrays
     expectations = np.asarray(expectations, np.float64)
-    best = optimum(arrays, expectations) if best is None else best
+    best = optimum(arrays, expectations)
     policy, weights = (np.asarray(leaf, np.float64) for leaf in (solution.policy, solution.weights))
     chex.assert_shape([solution.policy, solution.occupancy], features.shape[:2])
     chex.assert_shape(solution.weights, features.shape[2:])
@@ -98,14 +91,15 @@ def assert_certified(solution, arrays, expectations, *, eps=1e-6, best=None):
     assert solution.margin_bound >= best - min(eps, 1e-6)
     np.testing.assert_allclose(weights.sum(), 1.0, rtol=0, atol=eps)
     assert weights.min() >= 0
-    value, _ = oracles.optimal_value(transition, discount, features @ weights)
-    proved = value @ initial - weights @ expectations
-    assert solution.margin_bound >= proved - eps
+    reward = (features @ weights)[:, :, None]
+    proved = oracles.lpal(transition, discount, initial, reward, [weights @ expectations])[0]
+    assert proved - eps <= solution.margin_bound
+    assert solution.margin_bound <= proved + slack
     return best
 
 
-def assert_solved(solution, arrays, expectations, tolerance, **options):
-    best = assert_certified(solution, arrays, expectations, **options)
+def assert_solved(solution, arrays, expectations, tolerance):
+    best = assert_certified(solution, arrays, expectations, slack=tolerance)
     assert solution.status == Status.SOLVED
     assert solution.margin_bound - solution.margin <= tolerance
     assert abs(solution.margin - best) <= tolerance + 1e-6
@@ -136,9 +130,10 @@ def test_a_gridworld(name, method):
         assert_solved(solution, here.arrays, expectations, tolerance)
 
 
-def test_a_larger_gridworld():
+@pytest.mark.parametrize("name", ["Monte Carlo", "perturbed", "of both signs"])
+def test_a_larger_gridworld(name):
     here = grid(16)
-    expectations = here.expectations["Monte Carlo"]
+    expectations = here.expectations[name]
     assert_solved(lpal(here.mdp, expectations), here.arrays, expectations, 1e-3)
 
 
@@ -176,7 +171,7 @@ def test_a_batch_agrees_with_its_lanes_alone():
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("num_features", [1, 3, 6])
+@pytest.mark.parametrize("num_features", [1, 6])
 def test_dense_models(num_features, method):
     """As few features as one, and as many as states; eight lanes at once."""
     here = dense(num_features)
@@ -196,12 +191,21 @@ def test_one_feature_is_a_planning_problem(method):
     np.testing.assert_allclose(solution.weights, 1.0, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["one_state", "absorbing"])
-def test_degenerate_models(name):
-    """A single policy; states that nothing reaches, where eq. (5) is 0 / 0."""
-    case = small_models.case(name)
-    num_features = case.features.shape[2]
-    expectations = np.linspace(-1.0, 2.0, num_features)
+def test_states_that_nothing_reaches():
+    """Where eq. (5) is 0 / 0; the shapes are those of `dense(6)`, so nothing is compiled."""
+    transition, discount, initial, _ = small_models.case("absorbing").arrays
+    features = np.random.default_rng(1).uniform(-1, 1, size=(6, 2, 6))
+    mdp = MDP.from_dense(transition, discount=discount, initial=initial, features=features)
+    expectations = np.random.default_rng(2).uniform(-5, 5, size=(8, 6))
+    solution = lpal(mdp, expectations, tolerance=1e-5)
+    for i in range(8):
+        assert_solved(lane(solution, i), arrays_of(mdp), expectations[i], 1e-5)
+        np.testing.assert_array_equal(solution.occupancy[i, 3], 0.0)
+
+
+def test_one_state_and_one_policy():
+    case = small_models.case("one_state")
+    expectations = np.array([-1.0, 2.0])
     solution = lpal(case.mdp, expectations, tolerance=1e-5)
     assert_solved(solution, case.arrays, expectations, 1e-5)
 
@@ -209,34 +213,33 @@ def test_degenerate_models(name):
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_float32(scale):
     """The certificate holds for the rounded model; where rounding keeps it open, the status says so."""
-    here = dense(3, np.float32)
+    here = dense(6, np.float32)
     expectations = (scale * here.expectations).astype(np.float32)
     solution = lpal(here.mdp, expectations, tolerance=1e-3, max_iterations=30)
     assert solution.policy.dtype == solution.margin_bound.dtype == jnp.float32
     for i, expected in enumerate(expectations):
-        best = optimum(here.arrays, expected)
-        assert_certified(lane(solution, i), here.arrays, expected, eps=1e-5 * scale, best=best)
+        best = assert_certified(lane(solution, i), here.arrays, expected, eps=1e-5 * scale)
         assert solution.margin_bound[i] >= best
     is_closed = solution.margin_bound - solution.margin <= 1e-3
-    np.testing.assert_array_equal(solution.status == Status.SOLVED, is_closed)
+    stopped = Status.ITERATION_LIMIT if solution.iterations[0] == 30 else Status.STALLED
+    expected = np.where(is_closed, Status.SOLVED, stopped)
+    np.testing.assert_array_equal(solution.status, expected)
     assert scale > 1 or np.all(is_closed)
 
 
-@pytest.mark.parametrize("size", [-1e3, -1e5, 1e3])
-@pytest.mark.parametrize("num_features", [3, 20])
-def test_float32_bounds_hold_where_features_hardly_differ(num_features, size):
-    """The game is indifferent between the features; weights that leave the simplex by 1e-5 must not pass."""
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize("seed", range(2))
+def test_float32_bounds_hold_where_features_hardly_differ(seed):
+    """The game is then indifferent between them, and its weights leave the simplex by more than a rounding."""
+    rng = np.random.default_rng(seed)
     transition, discount, initial, feature = oracles.random_mdp(rng, 6, 2, K=1, discount=0.99)
-    features = feature + 1e-6 * rng.normal(size=(6, 2, num_features))
-    mdp = MDP.from_dense(
-        transition.astype(np.float32), discount=discount, initial=initial, features=features
-    )
-    expectations = np.full(num_features, size, np.float32)
-    solution = lpal(mdp, expectations, tolerance=1e-5, max_iterations=30)
-    best = optimum(arrays_of(mdp), expectations)
-    assert solution.margin_bound >= best
-    np.testing.assert_allclose(solution.margin, best, rtol=1e-6, atol=1e-3)
+    features = feature + 1e-6 * rng.normal(size=(6, 2, 6))
+    mdp = MDP.from_dense(transition.astype(np.float32), discount=discount, initial=initial, features=features)
+    sizes = -np.array([1e2, 3e2, 1e3, 3e3, 1e4, 3e4, 1e5, -1e3], np.float32)
+    solution = lpal(mdp, np.repeat(sizes[:, None], 6, axis=1), tolerance=1e-5, max_iterations=30)
+    for i, size in enumerate(sizes):
+        best = optimum(arrays_of(mdp), np.full(6, size))
+        assert solution.margin_bound[i] >= best
+        np.testing.assert_allclose(solution.margin[i], best, rtol=1e-6, atol=1e-3)
 
 
 # ---------------------------------------------------------------------------------- limits, options
@@ -244,19 +247,20 @@ def test_float32_bounds_hold_where_features_hardly_differ(num_features, size):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_one_iteration_gives_valid_bounds(method):
-    here = dense(3)
+    here = dense(6)
     solution = lpal(here.mdp, here.expectations, tolerance=1e-9, max_iterations=1, method=method)
     for i, expectations in enumerate(here.expectations):
         assert_certified(lane(solution, i), here.arrays, expectations)
     open_gap = solution.margin_bound - solution.margin > 1e-9
     assert open_gap.sum() > 4
-    assert np.all(solution.status[open_gap] == Status.ITERATION_LIMIT)
+    stopped = Status.STALLED if method == "interior_point" else Status.ITERATION_LIMIT
+    assert np.all(solution.status[open_gap] == stopped)
     assert np.all(solution.status[~open_gap] == Status.SOLVED)
 
 
 def test_the_default_tolerance_follows_discount_and_features():
     """1e-5 / (1 - discount) times the largest feature: the same columns for features in other units."""
-    here = dense(3)
+    here = dense(6)
     tolerance = 1e-5 / (1 - 0.9) * np.abs(here.arrays[3]).max()
     solution = lpal(here.mdp, here.expectations)
     gap = solution.margin_bound - solution.margin
@@ -264,13 +268,13 @@ def test_the_default_tolerance_follows_discount_and_features():
     scaled = lpal(here.mdp.replace(features=1e3 * here.mdp.features), 1e3 * here.expectations)
     np.testing.assert_array_equal(scaled.iterations, solution.iterations)
     np.testing.assert_allclose(scaled.margin, 1e3 * solution.margin, rtol=0, atol=1e3 * tolerance)
-    nothing = lpal(here.mdp.replace(features=0.0 * here.mdp.features), np.zeros(3))
-    assert nothing.margin == 0 and nothing.status == Status.SOLVED
+    nothing = lpal(here.mdp.replace(features=0.0 * here.mdp.features), np.zeros((8, 6)))
+    assert np.all(nothing.margin == 0) and np.all(nothing.status == Status.SOLVED)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_progress_is_shown_when_asked_for(method, capsys):
-    here = dense(3)
+    here = dense(6)
     lpal(here.mdp, here.expectations, method=method, max_iterations=2)
     assert capsys.readouterr().err == ""
     lpal(here.mdp, here.expectations, method=method, max_iterations=2, progress=True)
@@ -286,34 +290,26 @@ def test_policy_from_occupancy():
     np.testing.assert_array_equal(policy_from_occupancy(mdp, x, fallback)[0], expected)
 
 
-def test_lanes_of_one_shape_are_not_traced_again():
-    here = dense(3)
-    lpal(here.mdp, here.expectations, tolerance=1e-3, max_iterations=6)
-    chex.clear_trace_counter()
-    with jax.log_compiles(False), chex.fake_jit(False):
-        pass
-
-
 # ------------------------------------------------------------------------------ what is refused
 
 
 @pytest.mark.parametrize(
     ("expectations", "message"),
     [
-        (np.zeros(4), r"expectations must have shape \(3,\) or \(B, 3\), got \(4,\)"),
-        (np.zeros((2, 4)), r"expectations must have shape \(3,\) or \(B, 3\), got \(2, 4\)"),
-        (np.zeros((1, 2, 3)), r"expectations must have shape .*, got \(1, 2, 3\)"),
-        (np.zeros((0, 3)), r"expectations must have shape .*, got \(0, 3\)"),
+        (np.zeros(4), r"expectations must have shape \(6,\) or \(B, 6\), got \(4,\)"),
+        (np.zeros((6, 4)), r"expectations must have shape \(6,\) or \(B, 6\), got \(6, 4\)"),
+        (np.zeros((1, 2, 6)), r"expectations must have shape .*, got \(1, 2, 6\)"),
+        (np.zeros((0, 6)), r"expectations must have shape .*, got \(0, 6\)"),
         (1.0, r"expectations must have shape .*, got \(\)"),
-        ([0.0, np.nan, 0.0], r"expectations\[1\] must be finite, got nan"),
-        ([[0.0] * 3, [0.0, 0.0, np.inf]], r"expectations\[1, 2\] must be finite, got inf"),
-        (["a", "b", "c"], "expectations must hold real numbers"),
+        (np.where(np.arange(6) == 1, np.nan, 0), r"expectations\[1\] must be finite, got nan"),
+        (np.where(np.eye(6) > 0, np.inf, 0), r"expectations\[0, 0\] must be finite, got inf"),
+        (["a", "b", "c", "d", "e", "f"], "expectations must hold real numbers"),
         ([[0.0], [0.0, 0.0]], "expectations is not a rectangular array"),
     ],
 )
 def test_expectations_that_do_not_fit_are_refused(expectations, message):
     with pytest.raises(ValueError, match=message):
-        lpal(dense(3).mdp, expectations)
+        lpal(dense(6).mdp, expectations)
 
 
 @pytest.mark.parametrize(
@@ -327,7 +323,7 @@ def test_expectations_that_do_not_fit_are_refused(expectations, message):
     ],
 )
 def test_initial_policies_that_do_not_fit_are_refused(initial_policy, message):
-    here = dense(3)
+    here = dense(6)
     with pytest.raises(ValueError, match=message):
         lpal(here.mdp, here.expectations, initial_policy=initial_policy)
 
@@ -342,7 +338,7 @@ def test_initial_policies_that_do_not_fit_are_refused(initial_policy, message):
 )
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        lpal(dense(3).mdp, np.zeros(3), **options)
+        lpal(dense(6).mdp, np.zeros(6), **options)
 
 
 def test_a_model_without_features_is_refused():
@@ -351,11 +347,11 @@ def test_a_model_without_features_is_refused():
 
 
 def test_traced_input_is_refused():
-    here = dense(3)
+    here = dense(6)
     for function, argument in (
-        (lambda mdp: lpal(mdp, np.zeros(3)), here.mdp),
-        (lambda expectations: lpal(here.mdp, expectations), jnp.zeros(3)),
-        (lambda policy: lpal(here.mdp, np.zeros(3), initial_policy=policy), jnp.full((6, 2), 0.5)),
+        (lambda mdp: lpal(mdp, np.zeros(6)), here.mdp),
+        (lambda expectations: lpal(here.mdp, expectations), jnp.zeros(6)),
+        (lambda policy: lpal(here.mdp, np.zeros(6), initial_policy=policy), jnp.full((6, 2), 0.5)),
     ):
         with pytest.raises(ValueError, match="call it outside jit, vmap and grad"):
             jax.jit(function)(argument)

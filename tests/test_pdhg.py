@@ -284,9 +284,7 @@ def test_padding_changes_nothing(n, m, anchored, rng):
     plain = homomorphism_problem(source, target, anchored)
     room = [(0, 5 - n), (0, 0), (0, 5 - n), (0, 0)], [(0, 5 - m), (0, 0), (0, 5 - m), (0, 0)]
     padded = homomorphism_problem(np.pad(source, room[0]), np.pad(target, room[1]), anchored)
-    padded = dataclasses.replace(
-        padded, source_size=plain.source_size, target_size=plain.target_size
-    )
+    padded = dataclasses.replace(padded, source_size=plain.source_size, target_size=plain.target_size)
     f, y = rng.normal(size=(5, 5, 4)), np.zeros((5, 2, 5, 4))
     y[:n, :, :m] = rng.normal(size=(n, 2, m, 4))
 
@@ -435,9 +433,7 @@ def lpal_value(name, in_float32=False):
     return case, expectations, oracles.lpal(*case.arrays, expectations.astype(float))[0]
 
 
-@pytest.mark.parametrize(
-    ("name", "in_float32"), [("dense", False), ("absorbing", False), ("restart", True)]
-)
+@pytest.mark.parametrize(("name", "in_float32"), [("dense", False), ("absorbing", False), ("restart", True)])
 def test_flow_bounds_of_feasible_points(name, in_float32, rng):
     case, expectations, margin = lpal_value(name, in_float32)
     scaled = ((1 - case.discount) * expectations[:, None]).astype(case.mdp.dtype)
@@ -602,9 +598,7 @@ def test_many_problems_through_sixteen_lanes(total):
     problem, values = pairs()
     order = np.random.default_rng(total).permutation(np.resize(np.arange(16), total))
     finished, tolerance = [], 1e-4
-    state = solve_many(
-        lanes_of(problem, order), tolerance=tolerance, lanes=16, progress=finished.append
-    )
+    state = solve_many(lanes_of(problem, order), tolerance=tolerance, lanes=16, progress=finished.append)
     assert sum(finished) == total
     chex.assert_shape([state.lower, state.upper, state.steps], (total,))
     chex.assert_shape([state.best_primal, state.best_dual], [(3, 3, total), (3, 2, 3, total)])
@@ -620,9 +614,7 @@ def test_many_problems_agree_with_each_alone():
     for i in (0, 4, 17, 25, 30, 39):
         alone = solve(lanes_of(problem, [i % 16]), -1.0, state.steps[i])
         for field in ("steps", "lower", "upper", "best_primal", "best_dual"):
-            np.testing.assert_allclose(
-                state[field][..., i], alone[field][..., 0], rtol=1e-6, atol=1e-8, err_msg=field
-            )
+            np.testing.assert_allclose(state[field][..., i], alone[field][..., 0], rtol=1e-6, atol=1e-8, err_msg=field)
 
 
 def test_many_problems_with_a_threshold():
@@ -666,9 +658,7 @@ def test_other_problems_of_one_shape_are_not_traced_again(rng):
     def problems(total):
         source, target = random_pair(rng, 2, 2, num_actions=1, lanes=total)
         sizes = np.full(total, 2, np.int32)
-        return CountingProblem(
-            source=source, target=target, source_size=sizes, target_size=sizes, anchored=False
-        )
+        return CountingProblem(source=source, target=target, source_size=sizes, target_size=sizes, anchored=False)
 
     solve_many(problems(20), tolerance=1e-3, lanes=8)
     traced = len(_traces)

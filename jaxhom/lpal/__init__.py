@@ -58,7 +58,8 @@ def lpal(
       `LPALSolution`, with a leading axis [B] if the expectations have one. Its bounds hold whatever the status.
 
     Raises:
-      ValueError: on wrong shapes, expectations that are not finite, a model without features, an unknown method.
+      ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
+        distributions, a model without features, an unknown method.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
     """
@@ -69,17 +70,18 @@ def lpal(
     if checks.is_traced(mdp, expectations, initial_policy):
         raise ValueError("lpal adds columns on the host: call it outside jit, vmap and grad, in batches [B, K]")
     host = checks.as_host_array("expectations", expectations)
-    good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features
+    good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features and host.size > 0
     checks.require_shape("expectations", host, f"({mdp.num_features},) or (B, {mdp.num_features})", good)
     host = checks.require_floats("expectations", host)
     batch = jnp.asarray(np.atleast_2d(host), mdp.dtype)
     if initial_policy is not None:
-        initial_policy = jnp.asarray(initial_policy, mdp.dtype)
+        initial_policy = checks.as_host_array("initial_policy", initial_policy)
         check_policy_shape(mdp, initial_policy, "initial_policy")
         fits = initial_policy.ndim == 2 or len(initial_policy) == len(batch)
         checks.require_shape("initial_policy", initial_policy, f"({len(batch)}, S, A)", fits)
+        initial_policy = checks.require_distribution("initial_policy", initial_policy)
         shape = (len(batch), *initial_policy.shape[-2:])
-        initial_policy = jnp.broadcast_to(initial_policy, shape)
+        initial_policy = jnp.broadcast_to(jnp.asarray(initial_policy, mdp.dtype), shape)
     if tolerance is None:
         scale = float(jnp.abs(mdp.features).max())
         tolerance = 1e-5 / (1.0 - float(mdp.discount)) * (scale or 1.0)

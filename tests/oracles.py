@@ -345,9 +345,7 @@ def occupancy_regression(transition, discount, initial, coordinates, trajectorie
             ]
         ),
         b_eq=np.concatenate([initial, np.zeros(fixed.shape[0] + num_states)]),
-        bounds=[(0, None)] * num_states * num_actions
-        + [(None, None)] * 6
-        + [(0, None)] * 2 * num_states,
+        bounds=[(0, None)] * num_states * num_actions + [(None, None)] * 6 + [(0, None)] * 2 * num_states,
     )
     x = result.x[: num_states * num_actions].reshape(num_states, num_actions)
     policy = np.where(visited[:, None], empirical, policy_from_occupancy(x))
@@ -409,9 +407,7 @@ def _solve_lp(cost, A_ub=None, b_ub=None, A_eq=None, b_eq=None, bounds=None):
 # --------------------------------------------------------------------------------- evaluation
 
 
-def finite_horizon_evaluation(
-    transition, initial, policy, reward, horizon, terminal=None, events=None
-):
+def finite_horizon_evaluation(transition, initial, policy, reward, horizon, terminal=None, events=None):
     """Exact expectations over trials of at most `horizon` steps: a dict of floats.
 
     A trial ends when it enters a state of `terminal` (bool [S]): the step that enters it counts,

@@ -172,9 +172,7 @@ def slow_racetrack(track):
     return transition, events
 
 
-@pytest.mark.parametrize(
-    "lines", [STRAIGHT, CORNER, ["FFF", "...", "...", "S.S"], ["XX...", "XX..", "S...FF"]]
-)
+@pytest.mark.parametrize("lines", [STRAIGHT, CORNER, ["FFF", "...", "...", "S.S"], ["XX...", "XX..", "S...FF"]])
 def test_racetrack_agrees_with_a_slow_loop(lines):
     track = racetrack(lines)
     transition, events = slow_racetrack(track)
@@ -256,9 +254,7 @@ def test_expert_on_track_a_laps_in_21_steps_at_14_a_step(track_a):
     steps, gain = np.zeros((2, len(reward)))
     for _ in range(500):
         steps = onwards * (1 + np.sum(probability[best] * steps[next_state[best]], axis=-1))
-        gain = onwards * (
-            reward[best] + np.sum(probability[best] * gain[next_state[best]], axis=-1)
-        )
+        gain = onwards * (reward[best] + np.sum(probability[best] * gain[next_state[best]], axis=-1))
     start = track_a.state_of((7, 0))
     assert steps[start] == pytest.approx(19.859, abs=1e-3)
     assert gain[start] == pytest.approx(291.87, abs=1e-2)

@@ -74,9 +74,7 @@ def slow_evaluation(case, policy, reward, horizon, terminal, count_terminal_step
         policy = np.vstack([policy, np.full(A, 1 / A)])
         reward, *padded = (np.pad(x, ((0, 1), (0, 0))) for x in (reward, *events.values()))
         events = dict(zip(events, padded, strict=True))
-    measures = oracles.finite_horizon_evaluation(
-        transition, initial, policy, reward, horizon, terminal, events
-    )
+    measures = oracles.finite_horizon_evaluation(transition, initial, policy, reward, horizon, terminal, events)
     total_reward = measures["reward_per_step"] * measures["steps"]
     return measures | {"total_reward": total_reward, "finished": finished}
 
@@ -131,9 +129,7 @@ def test_a_chain_by_hand(goal, count, steps, finished):
 
 
 def test_trials_that_start_in_a_terminal_state_take_no_step():
-    ours = evaluate_exactly(
-        chain(2), np.ones((2, 1)), np.ones((2, 1)), 5, terminal=np.ones(2, bool)
-    )
+    ours = evaluate_exactly(chain(2), np.ones((2, 1)), np.ones((2, 1)), 5, terminal=np.ones(2, bool))
     assert (float(ours.steps), float(ours.total_reward), float(ours.finished)) == (0, 0, 1)
     assert np.isnan(ours.reward_per_step)
 
@@ -239,9 +235,7 @@ def test_the_dense_layout_is_the_sparse_one(case):
 def test_under_jit_and_vmap(case):
     def evaluate(policy, reward):
         arguments = (case["mdp"], policy, reward, H)
-        sampled = evaluate_by_sampling(
-            jax.random.key(0), *arguments, num_trials=TRIALS, **case["options"]
-        )
+        sampled = evaluate_by_sampling(jax.random.key(0), *arguments, num_trials=TRIALS, **case["options"])
         weighted = agreement(case["mdp"], policy, case["policies"][0], weights=reward[:, 0] ** 2)
         return evaluate_exactly(*arguments, **case["options"]), sampled, weighted
 
@@ -254,9 +248,7 @@ def test_policies_of_one_shape_are_compiled_once(case):
     def evaluate(index):
         arguments = (case["mdp"], case["policies"][index], case["rewards"][index], H)
         evaluate_exactly(*arguments, **case["options"])
-        evaluate_by_sampling(
-            jax.random.key(index), *arguments, num_trials=TRIALS, **case["options"]
-        )
+        evaluate_by_sampling(jax.random.key(index), *arguments, num_trials=TRIALS, **case["options"])
 
     jitted = (evaluation._evaluate_visits, evaluation._evaluate_trials)
     evaluate(0)
@@ -283,9 +275,7 @@ def test_gradient_against_finite_differences(case):
 def test_the_same_key_gives_the_same_trials(case):
     arguments = (case["mdp"], case["policies"][0], case["rewards"][0], H)
     first, again, other = (
-        evaluate_by_sampling(
-            jax.random.key(seed), *arguments, num_trials=TRIALS, **case["options"]
-        ).total_reward
+        evaluate_by_sampling(jax.random.key(seed), *arguments, num_trials=TRIALS, **case["options"]).total_reward
         for seed in (1, 1, 2)
     )
     assert float(first) == float(again) != float(other)
@@ -327,9 +317,7 @@ def test_agreement_is_one_minus_total_variation(case):
     np.testing.assert_allclose(ours, expected, rtol=1e-12)
     np.testing.assert_allclose(agreement(mdp, policies[0], policies), expected, rtol=1e-12)
     weights = np.random.default_rng(0).uniform(size=(B, S))
-    singles = [
-        agreement(mdp, policies[b], policies[0], weights[b] / weights[b].sum()) for b in range(B)
-    ]
+    singles = [agreement(mdp, policies[b], policies[0], weights[b] / weights[b].sum()) for b in range(B)]
     np.testing.assert_allclose(agreement(mdp, policies, policies[0], weights), singles, rtol=1e-12)
 
 

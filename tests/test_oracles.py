@@ -44,10 +44,7 @@ def test_occupancy_meets_the_flow_and_agrees_with_values(rng):
     np.testing.assert_allclose(x.sum(axis=1), initial + inflow, rtol=1e-12)
     assert x.sum() == pytest.approx(1 / (1 - discount))
     np.testing.assert_allclose(oracles.policy_from_occupancy(x), policy, rtol=1e-12)
-    values = [
-        initial @ oracles.policy_value(transition, discount, policy, features[:, :, k])
-        for k in range(3)
-    ]
+    values = [initial @ oracles.policy_value(transition, discount, policy, features[:, :, k]) for k in range(3)]
     np.testing.assert_allclose(oracles.feature_expectations(*model, policy), values, rtol=1e-12)
 
 
@@ -157,15 +154,10 @@ def test_homomorphism_error_of_two_states_by_brute_force(rng):
         scan = np.linspace(0, 1, 101)
         rows = np.stack([scan, 1 - scan], axis=1)
         residuals = np.array(
-            [
-                [oracles.homomorphism_residual(source, target, np.stack([p, q])) for q in rows]
-                for p in rows
-            ]
+            [[oracles.homomorphism_residual(source, target, np.stack([p, q])) for q in rows] for p in rows]
         )
         # the residual moves by at most 2 for a unit of p or q, the nearest point is 0.005 away
-        free, anchored = (
-            oracles.homomorphism_lp(source, target, flag)[0] for flag in (False, True)
-        )
+        free, anchored = (oracles.homomorphism_lp(source, target, flag)[0] for flag in (False, True))
         assert residuals.min() - 0.02 <= free <= residuals.min() + 1e-8
         assert residuals[-1].min() - 0.01 <= anchored <= residuals[-1].min() + 1e-8
 
@@ -307,12 +299,8 @@ def test_occupancy_regression(rng):
     coordinates = np.stack(np.divmod(np.arange(n * n), n), axis=1)
     demonstrations = one_step([0, 1, 5], [3, 1, 1])
     visited, empirical = oracles.empirical_policy(n * n, 4, demonstrations)
-    x, policy, objective = oracles.occupancy_regression(
-        transition, discount, initial, coordinates, demonstrations
-    )
-    np.testing.assert_allclose(
-        oracles.occupancy(transition, discount, initial, policy), x, atol=1e-8
-    )
+    x, policy, objective = oracles.occupancy_regression(transition, discount, initial, coordinates, demonstrations)
+    np.testing.assert_allclose(oracles.occupancy(transition, discount, initial, policy), x, atol=1e-8)
     np.testing.assert_allclose(policy[visited], empirical[visited])
     p, q = coordinates.T
     basis = np.stack([np.ones(n * n), p, q, p**2, q**2, p * q], axis=1)
@@ -343,9 +331,7 @@ def test_lpal_margin_is_attained_and_certified(seed):
     model = transition, discount, initial, features = oracles.random_mdp(rng, 10, 3, N=3, K=4)
     expectations = rng.uniform(0, 10, size=4)
     best, x, weights = oracles.lpal(*model, expectations)
-    assert oracles.margin(*model, expectations, oracles.policy_from_occupancy(x)) == pytest.approx(
-        best, abs=1e-8
-    )
+    assert oracles.margin(*model, expectations, oracles.policy_from_occupancy(x)) == pytest.approx(best, abs=1e-8)
     assert weights.sum() == pytest.approx(1)
     assert np.all(weights >= -1e-9)
     value, _ = oracles.optimal_value(transition, discount, features @ weights)
@@ -371,13 +357,9 @@ def test_evaluation_of_a_chain_stops_at_its_end():
     reward = np.array([[1.0], [2.0], [10.0], [100.0]])
     terminal = np.array([False, False, False, True])
     event = {"leaves the start": np.array([[1.0], [0], [0], [0]])}
-    result = oracles.finite_horizon_evaluation(
-        transition, initial, policy, reward, 9, terminal, event
-    )
+    result = oracles.finite_horizon_evaluation(transition, initial, policy, reward, 9, terminal, event)
     # half the trials take 3 steps (1 + 2 + 10), half take 1 (10)
-    assert result == pytest.approx(
-        {"steps": 2.0, "reward_per_step": 11.5 / 2.0, "leaves the start": 0.5 / 2.0}
-    )
+    assert result == pytest.approx({"steps": 2.0, "reward_per_step": 11.5 / 2.0, "leaves the start": 0.5 / 2.0})
     result = oracles.finite_horizon_evaluation(transition, initial, policy, reward, 2, terminal)
     assert result == pytest.approx({"steps": 1.5, "reward_per_step": 6.5 / 1.5})
     result = oracles.finite_horizon_evaluation(transition, initial, policy, reward, 2)
@@ -390,9 +372,7 @@ def test_evaluation_agrees_with_sampling(rng):
     result = oracles.finite_horizon_evaluation(transition, initial, policy, reward, 6)
     samples = [
         reward[states, actions].mean()
-        for states, actions in oracles.sample_trajectories(
-            rng, transition, initial, policy, 2000, 6
-        )
+        for states, actions in oracles.sample_trajectories(rng, transition, initial, policy, 2000, 6)
     ]
     standard_error = np.std(samples) / np.sqrt(len(samples))
     assert abs(np.mean(samples) - result["reward_per_step"]) < 4 * standard_error

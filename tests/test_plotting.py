@@ -93,9 +93,7 @@ DRAW = {
     "policy": lambda domain, ax: plotting.plot_policy(domain, uniform(domain), ax=ax),
     "trajectories": lambda domain, ax: plotting.plot_trajectories(domain, sampled(domain), ax=ax),
     "occupancy": lambda domain, ax: plotting.plot_occupancy(domain, uniform(domain), ax=ax),
-    "radius": lambda domain, ax: plotting.plot_radius(
-        domain, np.arange(domain.mdp.num_states) % 5 - 1, ax=ax
-    ),
+    "radius": lambda domain, ax: plotting.plot_radius(domain, np.arange(domain.mdp.num_states) % 5 - 1, ax=ax),
 }
 
 
@@ -157,9 +155,7 @@ def test_a_deterministic_policy_has_one_centred_arrow_per_cell(world, ax, action
     plotting.plot_policy(world, one_action(world, action), ax=ax)
     (arrows,) = of_type(ax, matplotlib.quiver.Quiver)
     direction = [(0, -1), (0, 1), (-1, 0), (1, 0)][action]  # x, y: up, down, left, right
-    np.testing.assert_allclose(
-        np.stack([arrows.U, arrows.V], -1), np.tile(np.multiply(0.8, direction), (16, 1))
-    )
+    np.testing.assert_allclose(np.stack([arrows.U, arrows.V], -1), np.tile(np.multiply(0.8, direction), (16, 1)))
     middle = np.stack([arrows.X + arrows.U / 2, arrows.Y + arrows.V / 2], -1)
     np.testing.assert_allclose(middle, np.asarray(world.coordinates)[:, ::-1], atol=1e-12)
 
@@ -337,9 +333,7 @@ MALFORMED = {
         "policy must have shape",
     ),
     "racetrack trajectories": (
-        lambda w, t: plotting.plot_racetrack(
-            t, trajectories=Demonstrations.from_trajectories([([STATES], [0])])
-        ),
+        lambda w, t: plotting.plot_racetrack(t, trajectories=Demonstrations.from_trajectories([([STATES], [0])])),
         "states.* must lie in",
     ),
     "racetrack speed": (
@@ -353,9 +347,7 @@ MALFORMED = {
     ),
     "speed": (lambda w, t: plotting.plot_policy(t, uniform(t), speed=(0, 3)), "speed must be"),
     "trajectories": (
-        lambda w, t: plotting.plot_trajectories(
-            w, Demonstrations.from_trajectories([([0, 16], [0, 0])])
-        ),
+        lambda w, t: plotting.plot_trajectories(w, Demonstrations.from_trajectories([([0, 16], [0, 0])])),
         r"states\[0, 1\] must lie in \[0, 16\)",
     ),
     "occupancy": (

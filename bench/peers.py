@@ -280,7 +280,7 @@ def _mpax_solver(n: int, m: int, num_actions: int, gap: float):
 
 def _mpax_pairs(method, sources, targets, gap):
     start = time.perf_counter()
-    template, solve = _mpax_solver(sources.shape[1], targets.shape[1], sources.shape[2], 0.3 * gap)
+    template, solve = _mpax_solver(sources.shape[1], targets.shape[1], sources.shape[2], 0.1 * gap)
     values = np.stack([template.values(*pair) for pair in zip(sources, targets, strict=True)])
     build = time.perf_counter() - start
     x, multipliers = map(np.asarray, solve(values))

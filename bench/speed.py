@@ -167,7 +167,7 @@ def plot(rows: list[dict], path: pathlib.Path) -> None:
     axes.set_ylabel("milliseconds per pair")
     axes.set_title("Certified brackets of 1e-4, random pairs, two cores")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper left")
     figure.savefig(path, dpi=150)
     plt.close(figure)
 

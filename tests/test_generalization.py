@@ -268,26 +268,27 @@ METHODS = {
 
 @pytest.mark.parametrize("method", [soft_local_homomorphism, nearest_neighbors])
 def test_states_that_cannot_reach_a_demonstrated_one_stay_uniform(method):
-    """Two grids that never meet, of which one was visited; and a chain, where only its end was."""
-    grid = oracles.gridworld_transition(2)
+    """Two grids that never meet, one seen in its middle; and a chain, seen at its head or in its middle."""
+    grid = oracles.gridworld_transition(3)
     chain = np.eye(4)[[1, 2, 3, 3]][:, None].repeat(4, axis=1)
-    transition = np.zeros((12, 4, 12))
-    for first, block in ((0, grid), (4, grid), (8, chain)):
-        transition[first : first + 4, :, first : first + 4] = block
+    transition = np.zeros((22, 4, 22))
+    for first, block in ((0, grid), (9, grid), (18, chain)):
+        last = first + len(block)
+        transition[first:last, :, first:last] = block
     mdp = MDP.from_dense(transition, discount=0.9)
-    for end, radius in ((8, [0, -1, -1, -1]), (10, [2, 1, 0, -1])):
-        trajectories = [(np.array([1, end]), np.array([2, 3]))]
+    for seen, by_hand in ((18, [0, -1, -1, -1]), (20, [2, 1, 0, -1])):
+        trajectories = [(np.array([4, seen]), np.array([2, 3]))]
         result = method(mdp, Demonstrations.from_trajectories(trajectories))
-        np.testing.assert_array_equal(result.radius[4:8], -1)
-        np.testing.assert_array_equal(result.support[4:8], 0)
-        np.testing.assert_array_equal(result.policy[4:8], 0.25)
+        np.testing.assert_array_equal(result.radius[9:18], -1)
+        np.testing.assert_array_equal(result.support[9:18], 0)
+        np.testing.assert_array_equal(result.policy[9:18], 0.25)
         if method is nearest_neighbors:
-            np.testing.assert_array_equal(result.radius, [1, 0, 2, 1] + [-1] * 4 + radius)
-        expected, radius = (
-            oracles.algorithm1(transition, trajectories)
-            if method is soft_local_homomorphism
-            else oracles.hops_nearest_neighbors(transition, trajectories)
-        )
+            np.testing.assert_array_equal(result.radius[:9], [2, 1, 2, 1, 0, 1, 2, 1, 2])
+            np.testing.assert_array_equal(result.radius[18:], by_hand)
+            oracle = oracles.hops_nearest_neighbors
+        else:
+            oracle = oracles.algorithm1
+        expected, radius = oracle(transition, trajectories)
         np.testing.assert_array_equal(result.radius, radius)
         np.testing.assert_allclose(result.policy, expected, rtol=0, atol=1e-12)
 

@@ -105,7 +105,7 @@ def assert_lanes(good, cases, what):
     assert not wrong, f"{what}: {wrong}"
 
 
-@pytest.mark.parametrize("length", [1, 7, 40])
+@pytest.mark.parametrize("length", [1, 40])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_projections_against_jaxopt(dtype, length):
     assert_projects(dtype, points(dtype, length))
@@ -198,7 +198,7 @@ def test_reduce_leading_over_several_axes(axes):
 
 # --------------------------------------------------------------------------------------- products
 
-SIZES = [(1, 1), (3, 5), (5, 2), (17, 16)]  # the last one is beyond what is written out
+SIZES = [(1, 1), (3, 5), (17, 16)]  # the last one is beyond what is written out
 
 
 def random_pair(rng, n, m, num_actions=3, lanes=4, dtype=float):

@@ -50,16 +50,18 @@ def compare_table1(rows: Iterable[Row]) -> list[Cell]:
         printed_ratio = printed / paper.get((grid, regions, "expert"), np.nan)
         reward = mean_interval([row.reward_per_step for row in group])
         ratio = mean_interval(ratios)
-        noise = _TWO_SIDED * np.sqrt(2) * _trial_noise(group)
-        verdict = _verdict(printed_ratio, ratio, ratios, noise)
+        verdict = _verdict(printed_ratio, ratio, ratios, _gap_noise(group))
         cells.append(Cell(grid, regions, method, reward, ratio, printed, printed_ratio, verdict))
     return cells
 
 
-def _trial_noise(group: Sequence[Row]) -> float:
-    """Standard error of the mean of 1000 trials, as a share of the expert's reward; 0 where none were run."""
+def _gap_noise(group: Sequence[Row]) -> float:
+    """What two means of 1000 trials leave open of their difference, at 95%, as a share of the expert's reward.
+
+    0 where no trials were run.
+    """
     errors = [row.sampled_error / row.expert_reward for row in group if row.sampled_error is not None]
-    return float(np.mean(errors)) if errors else 0.0
+    return _TWO_SIDED * float(np.sqrt(2) * np.mean(errors)) if errors else 0.0
 
 
 def _verdict(printed: float, ratio: Interval, ratios: np.ndarray, noise: float) -> str:
@@ -77,6 +79,7 @@ class Order:
 
     Attributes:
       better, worse: by the paper. printed: gap of the printed ratios.
+      noise: what 1000 trials leave open of a gap, at 95%.
       ours: interval of better - worse, paired by draw.
     """
 
@@ -85,6 +88,7 @@ class Order:
     better: str
     worse: str
     printed: float
+    noise: float
     ours: Interval
 
     @property
@@ -101,7 +105,7 @@ def compare_orders(rows: Iterable[Row]) -> list[Order]:
     """Every pair of methods in every row where the paper's gap exceeds our interval's half-width."""
     paper, orders = paper_table1(), []
     for (domain, regions), group in grouped(rows, lambda row: (row.domain, row.regions)):
-        grid = int(domain.removeprefix("grid"))
+        grid, noise = int(domain.removeprefix("grid")), _gap_noise(group)
         ratios = {}
         for row in group:
             ratios.setdefault(row.method, {})[row.draw] = row.reward_per_step / row.expert_reward
@@ -112,7 +116,7 @@ def compare_orders(rows: Iterable[Row]) -> list[Order]:
             gap = paper[grid, regions, better] - paper[grid, regions, worse]
             gap /= paper[grid, regions, "expert"]
             if ours.count > 1 and gap > ours.half_width:
-                orders.append(Order(grid, regions, better, worse, gap, ours))
+                orders.append(Order(grid, regions, better, worse, gap, noise, ours))
     return orders
 
 
@@ -126,12 +130,14 @@ def table1_words(cells: Sequence[Cell], orders: Sequence[Order]) -> list[str]:
         f"which the paper has one per row; {counts[DIFFERS]} differ by more than that."
     ]
     paragraphs += [_cell_words(method, cells) for method in dict.fromkeys(cell.method for cell in cells)]
-    kept = sum(order.is_reproduced for order in orders)
+    lost = [order for order in orders if not order.is_reproduced]
+    clear = [order for order in lost if order.printed > order.noise]
     paragraphs.append(
         f"Order of the methods: in {len(orders)} pairs of methods within a row the paper's gap exceeds our interval; "
-        f"{kept} are in the same order here."
+        f"{len(orders) - len(lost)} of them are in the same order here. Of the other {len(lost)}, "
+        f"{len(lost) - len(clear)} have a printed gap that the noise of 1000 trials explains."
     )
-    return [text for text in paragraphs + _order_words(orders) if text]
+    return [text for text in paragraphs + _order_words(clear) if text]
 
 
 def _cell_words(method: str, cells: Sequence[Cell]) -> str:
@@ -147,18 +153,17 @@ def _cell_words(method: str, cells: Sequence[Cell]) -> str:
     return f"**{method}** differs by more than draws and trials explain. {listed}."
 
 
-def _order_words(orders: Sequence[Order]) -> list[str]:
+def _order_words(lost: Sequence[Order]) -> list[str]:
     """One sentence for every two methods whose order is not the paper's in some row."""
     paragraphs = []
-    lost = [order for order in orders if not order.is_reproduced]
     for pair in dict.fromkeys((order.better, order.worse) for order in lost):
         rows = [order for order in lost if (order.better, order.worse) == pair]
         listed = "; ".join(
-            f"{order.grid}x{order.grid}/{order.regions}: {100 * order.printed:+.1f}% printed, "
+            f"{order.grid}x{order.grid} with {order.regions} regions: {100 * order.printed:+.1f}% printed, "
             f"{_percent(order.ours)} here{'' if order.is_reversed else ' (not separated)'}"
             for order in rows
         )
-        paragraphs.append(f"Not reproduced: {pair[0]} above {pair[1]} in {listed}.")
+        paragraphs.append(f"Not reproduced: {pair[0]} above {pair[1]}. {listed}.")
     return paragraphs
 
 

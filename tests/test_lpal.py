@@ -150,23 +150,6 @@ def test_the_policy_that_the_expectations_came_from_is_optimal(method):
     assert_certified(cut_short, here.arrays, expectations)
 
 
-def test_a_batch_agrees_with_its_lanes_alone():
-    here = grid(8)
-    expectations = np.stack([here.expectations[name] for name in HARD[:3]])
-    batch = lpal(here.mdp, expectations, tolerance=1e-2)
-    chex.assert_shape([batch.policy, batch.occupancy], (3, 64, 4))
-    chex.assert_shape(batch.weights, (3, 16))
-    chex.assert_shape([batch.margin, batch.margin_bound, batch.iterations, batch.status], (3,))
-    for i in range(3):
-        assert_solved(lane(batch, i), here.arrays, expectations[i], 1e-2)
-        alone = lpal(here.mdp, expectations[i], tolerance=1e-2)
-        np.testing.assert_allclose(batch.margin[i], alone.margin, rtol=0, atol=1e-2)
-    first = np.stack([here.policy, np.full((64, 4), 0.25), here.policy])
-    warm = lpal(here.mdp, expectations, initial_policy=first, tolerance=1e-2)
-    for i in range(3):
-        assert_solved(lane(warm, i), here.arrays, expectations[i], 1e-2)
-
-
 # ------------------------------------------------------------------------------------ small models
 
 
@@ -177,6 +160,30 @@ def test_dense_models(method):
     solution = lpal(here.mdp, here.expectations, tolerance=1e-4, method=method)
     for i, expectations in enumerate(here.expectations):
         assert_solved(lane(solution, i), here.arrays, expectations, 1e-4)
+
+
+def test_a_batch_agrees_with_its_lanes_alone():
+    here = dense(6)
+    batch = lpal(here.mdp, here.expectations, tolerance=1e-4)
+    chex.assert_shape([batch.policy, batch.occupancy], (8, 6, 2))
+    chex.assert_shape(batch.weights, (8, 6))
+    chex.assert_shape([batch.margin, batch.margin_bound, batch.iterations, batch.status], (8,))
+    for i, expectations in enumerate(here.expectations):
+        alone = lpal(here.mdp, expectations, tolerance=1e-4)
+        assert_solved(alone, here.arrays, expectations, 1e-4)
+        np.testing.assert_allclose(batch.margin[i], alone.margin, rtol=0, atol=1e-4)
+        assert batch.iterations[i] >= alone.iterations
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_first_guesses_of_a_batch(method):
+    """One policy for all lanes, or one for each."""
+    here = dense(6)
+    policies = np.random.default_rng(3).dirichlet(np.ones(2), size=(8, 6))
+    for first in (here.policy, policies):
+        solution = lpal(here.mdp, here.expectations, initial_policy=first, method=method, tolerance=1e-4)
+        for i, expectations in enumerate(here.expectations):
+            assert_solved(lane(solution, i), here.arrays, expectations, 1e-4)
 
 
 @pytest.mark.parametrize("method", ["columns", "interior_point"])

@@ -9,11 +9,11 @@ from collections.abc import Callable
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import interior_point
-from jaxhom.pdhg import Status, engine, solve_many
+from jaxhom.lane_queue import solve_many
+from jaxhom.pdhg import Status, engine
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
 METHODS = ("auto", "pdhg", "interior_point")
@@ -22,7 +22,7 @@ _MAX_LANES = 64
 _BATCH_BYTES = 32 * 2**20
 _CHUNK_PAIRS = 16_384
 _MAX_INTERIOR_SIZE = 16  # larger models: the normal matrix, (n m)^2, is slower than PDHG
-_INTERIOR_LANES = 32
+_INTERIOR_BYTES = 4 * 2**20
 
 
 @chex.dataclass(frozen=True)
@@ -52,7 +52,7 @@ def bracket_errors(
     threshold: float | None = None,
     method: str = "auto",
     max_iterations: int = 100_000,
-    progress: Callable[[int], object] = lambda count: None,
+    progress: Callable[[int], object] | None = None,
 ) -> LocalSimilarity:
     """Brackets the optimal errors of LP (9) for P pairs of models given as arrays.
 
@@ -72,6 +72,7 @@ def bracket_errors(
 
     Source: Boularias and Chaib-draa 2010, eq. (9).
     """
+    progress = progress or _no_progress
     count, n = source.shape[:2]
     m = target.shape[1]
     if source_size is None:
@@ -101,11 +102,7 @@ def bracket_errors(
             target_size=target_size[chunk],
             anchored=anchored,
         )
-        if method == "interior_point" or (method == "auto" and _suits_interior_point(problem, tolerance, threshold)):
-            solve = _by_interior_point
-        else:
-            solve = _by_pdhg
-        found = solve(problem, tolerance, threshold, max_iterations, progress)
+        found = _solve(problem, method, tolerance, threshold, max_iterations, progress)
         for name in ("lower", "upper", "iterations", "status"):
             getattr(result, name)[chunk] = getattr(found, name)
     return result
@@ -126,66 +123,70 @@ def lower_bounds_without_iterations(source: np.ndarray, target: np.ndarray) -> n
     return np.maximum(np.maximum(staying, leaving) - rounding, 0.0).astype(source.dtype)
 
 
-def _suits_interior_point(problem: HomomorphismProblem, tolerance: float, threshold: float | None) -> bool:
-    """Tight brackets of small models in float64 on a CPU; decisions and coarse brackets are PDHG's."""
-    is_small = max(problem.source.shape[0], problem.target.shape[0]) <= _MAX_INTERIOR_SIZE
-    is_tight = threshold is None and tolerance <= 1e-3
-    return is_small and is_tight and problem.source.dtype == np.float64 and jax.default_backend() == "cpu"
+def suits_interior_point(source: jax.Array, target: jax.Array, tolerance: float) -> bool:
+    """Whether the interior-point method is the faster one for tight brackets: small models in float64 on a CPU.
+
+    Args:
+      source: [n, ...]. target: [m, ...].
+    """
+    is_small = max(source.shape[0], target.shape[0]) <= _MAX_INTERIOR_SIZE
+    return is_small and tolerance <= 1e-3 and source.dtype == np.float64 and jax.default_backend() == "cpu"
 
 
-def _by_pdhg(problem, tolerance, threshold, max_iterations, progress) -> LocalSimilarity:
-    n, num_actions, _, _ = problem.source.shape
-    m = problem.target.shape[0]
-    # Both models and the six pairs of points that the engine keeps, per lane.
-    entries = num_actions * (n * n + m * m + 6 * n * m) + 6 * n * m
-    fitting = max(1, _BATCH_BYTES // (entries * problem.source.dtype.itemsize))
-    state = solve_many(
-        problem,
-        tolerance=tolerance,
-        threshold=threshold,
-        max_iterations=max_iterations,
-        lanes=int(min(_MAX_LANES, 2 ** int(np.log2(fitting)))),
-        progress=progress,
-    )
-    settled = engine.is_settled(state, tolerance, threshold)
-    return LocalSimilarity(
-        lower=state.lower,
-        upper=state.upper,
-        iterations=state.steps,
-        status=np.where(settled, Status.SOLVED, Status.ITERATION_LIMIT).astype(np.int32),
-    )
-
-
-def _by_interior_point(problem, tolerance, threshold, max_iterations, progress) -> LocalSimilarity:
-    """Batches of a fixed width; the lanes that stall short of the tolerance go on to PDHG."""
+def _solve(problem, method, tolerance, threshold, max_iterations, progress) -> LocalSimilarity:
+    """Brackets of the lanes of a problem; what the interior-point method leaves open, PDHG finishes."""
+    is_tight = threshold is None and suits_interior_point(problem.source, problem.target, tolerance)
+    stages = [(engine.SOLVER, max_iterations, _pdhg_lanes(problem))]
+    if method == "interior_point" or (method == "auto" and is_tight):
+        stages.insert(0, (interior_point.SOLVER, interior_point.MAX_ITERATIONS, _interior_lanes(problem)))
     count = problem.source.shape[-1]
-    lower, upper = np.zeros((2, count), problem.source.dtype)
+    lower, upper = np.zeros(count, problem.source.dtype), np.full(count, np.inf, problem.source.dtype)
     iterations = np.zeros(count, np.int32)
-    limit = None if threshold is None else jnp.asarray(threshold, problem.source.dtype)
-    for start in range(0, count, _INTERIOR_LANES):
-        index = np.arange(start, min(start + _INTERIOR_LANES, count))
-        padded = np.resize(index, _INTERIOR_LANES)  # one shape; the surplus repeats
-        state = _interior_point(_take(problem, padded), tolerance, limit)
-        lower[index], upper[index] = state.lower[: len(index)], state.upper[: len(index)]
-        iterations[index] = state.steps[: len(index)]
-        progress(len(index))
-    status = np.full(count, Status.SOLVED, np.int32)
-    is_open = upper - lower > tolerance
-    if threshold is not None:
-        is_open &= (lower <= threshold) & (upper > threshold + tolerance)
-    (rest,) = np.nonzero(is_open)
-    if rest.size:
-        finished = _by_pdhg(_take(problem, rest), tolerance, threshold, max_iterations, lambda count: None)
-        lower[rest] = np.maximum(lower[rest], finished.lower)
-        upper[rest] = np.minimum(upper[rest], finished.upper)
-        iterations[rest], status[rest] = finished.iterations, finished.status
+    for solver, limit, lanes in stages:
+        (rest,) = np.nonzero(~_is_settled(lower, upper, tolerance, threshold))
+        if not rest.size:
+            break
+        found = solve_many(
+            solver,
+            jax.tree.map(lambda leaf, rest=rest: leaf[..., rest], problem),
+            tolerance=tolerance,
+            threshold=threshold,
+            max_iterations=limit,
+            lanes=lanes,
+            keep=("lower", "upper", "steps"),
+            progress=progress,
+        )
+        lower[rest] = np.maximum(lower[rest], found["lower"])
+        upper[rest] = np.minimum(upper[rest], found["upper"])
+        iterations[rest] = found["steps"]
+        progress = _no_progress  # every pair has been counted
+    settled = _is_settled(lower, upper, tolerance, threshold)
+    status = np.where(settled, Status.SOLVED, Status.ITERATION_LIMIT).astype(np.int32)
     return LocalSimilarity(lower=lower, upper=upper, iterations=iterations, status=status)
 
 
-def _take(problem: HomomorphismProblem, lanes: np.ndarray) -> HomomorphismProblem:
-    return jax.tree.map(lambda leaf: leaf[..., lanes], problem)
+def _no_progress(count: int) -> None:
+    del count
 
 
-@jax.jit
-def _interior_point(problem, tolerance, threshold) -> interior_point.InteriorPointState:
-    return interior_point.solve(problem, tolerance=tolerance, threshold=threshold)
+def _is_settled(lower, upper, tolerance, threshold) -> np.ndarray:
+    settled = upper - lower <= tolerance
+    if threshold is not None:
+        settled |= (lower > threshold) | (upper <= threshold + tolerance)
+    return settled
+
+
+def _pdhg_lanes(problem) -> int:
+    """Both models and the six pairs of points that the engine keeps have to fit into the cache."""
+    n, num_actions, m = *problem.source.shape[:2], problem.target.shape[0]
+    return _fitting_lanes(problem, num_actions * (n * n + m * m + 6 * n * m) + 6 * n * m, _BATCH_BYTES)
+
+
+def _interior_lanes(problem) -> int:
+    """A few normal matrices have to."""
+    return _fitting_lanes(problem, (problem.source.shape[0] * problem.target.shape[0]) ** 2, _INTERIOR_BYTES)
+
+
+def _fitting_lanes(problem, entries: int, num_bytes: int) -> int:
+    fitting = max(1, num_bytes // (entries * problem.source.dtype.itemsize))
+    return int(min(_MAX_LANES, 2 ** int(np.log2(fitting))))

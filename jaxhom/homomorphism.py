@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom import checks
-from jaxhom.brackets import METHODS, LocalSimilarity, bracket_errors
+from jaxhom import checks, interior_point
+from jaxhom.brackets import METHODS, LocalSimilarity, bracket_errors, suits_interior_point
 from jaxhom.local_models import (
     LocalModelClasses,
     local_model_classes,
@@ -32,7 +32,6 @@ from jaxhom.mdp import MDP
 from jaxhom.pdhg import Status, engine
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
-_METHODS = ("auto", "pdhg")
 _SMALL = 8  # local models up to this size share one padding
 _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
 _CHUNK_BYTES = 256 * 2**20
@@ -332,7 +331,13 @@ def _solve_batch(sources, targets, anchored):
         anchored=anchored,
     )
     tolerance = 1e-6 if sources.dtype == jnp.float64 else 1e-4
-    state = engine.solve(problem, engine.init(problem), tolerance=tolerance, max_iterations=_MAX_ITERATIONS)
+    state = engine.init(problem)
+    if suits_interior_point(problem.source, problem.target, tolerance):
+        # PDHG finishes what is left open, which takes no iteration where nothing is.
+        near = interior_point.solve(problem, tolerance=tolerance)
+        points = {"best_primal": near.f, "best_dual": near.plus - near.minus}
+        state = state.replace(lower=near.lower, upper=near.upper, primal=near.f, anchor_primal=near.f, **points)
+    state = engine.solve(problem, state, tolerance=tolerance, max_iterations=_MAX_ITERATIONS)
     error = 0.5 * (state.lower + state.upper)
     return error, jnp.moveaxis(state.best_primal, -1, 0), jnp.moveaxis(state.best_dual, -1, 0)
 

@@ -6,27 +6,32 @@ s+ = e - K f and s- = e + K f, multipliers y+, y-, z and lambda, the central pat
     K^T (y+ - y-) - z - E^T lambda = 0,   sum(y+ + y-) = 1,   E f = 1,   y s = mu,   z f = mu,
 
 E summing the rows of f. A strictly feasible start always exists (uniform rows, e above |K f|, uniform y), so every
-iterate is feasible and certifies its own bracket. Each step is Mehrotra's predictor and corrector (1992): one Cholesky
-factorisation of the normal matrix K^T (D+ + D-) K + Z / F, whose size is that of f and which is put together from
-contractions of the two models, never from K. A step that is not finite is refused, and the lane stops where it is.
+iterate is feasible and certifies its own bracket. Each step is Mehrotra's predictor and corrector (1992), followed by
+centrality correctors after Gondzio (1996), which cost a solve each where the factorisation costs twenty and save every
+fifth step. A step that is not finite is refused, and the lane stops where it is.
 """
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem, plain_adjoint, plain_forward
+from jaxhom.homomorphism_newton import factorise
+from jaxhom.lane_queue import Solver
+from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
+MAX_ITERATIONS = 60
 _TO_BOUNDARY = 0.99
+_CORRECTORS = 2
+_CENTRED = (0.1, 10.0)  # products y s within these multiples of mu are left alone
 
 
 @chex.dataclass(frozen=True)
 class InteriorPointState:
-    """Iterates and best bounds of B lanes, lanes first.
+    """Iterates and best bounds, lanes last.
 
     Attributes:
-      f: [B, n, m]. e: [B]. plus, minus: y+ and y-, [B, n, A, m]. z: [B, n, m].
-      lower, upper: [B], best bounds. steps: int32 [B]. alive: bool [B], False once a step was refused.
+      f: [n, m, lanes]. e: [lanes]. plus, minus: y+ and y-, [n, A, m, lanes]. z: [n, m, lanes].
+      lower, upper: [lanes], best bounds. steps: int32 [lanes]. alive: bool [lanes], False once a step was refused.
     """
 
     f: jax.Array
@@ -40,179 +45,149 @@ class InteriorPointState:
     alive: jax.Array
 
 
-def solve(problem: HomomorphismProblem, *, tolerance, threshold=None, max_iterations: int = 60) -> InteriorPointState:
-    """Iterates until every lane has a bracket of the tolerance, has decided the threshold, or cannot go on."""
-    models = (jnp.moveaxis(problem.source, -1, 0), jnp.moveaxis(problem.target, -1, 0))
-    rows, columns = (jnp.moveaxis(mask, -1, 0) for mask in problem.masks((len(problem.source), len(problem.target))))
-    real = jnp.broadcast_to(rows & columns, (models[0].shape[0], problem.source.shape[0], problem.target.shape[0]))
-    free = real.at[:, 0].set(False) if problem.anchored else real
+def init(problem: HomomorphismProblem) -> InteriorPointState:
+    """Uniform f and y, e well above |K f|, and z constant on the free entries: strictly feasible."""
+    real, free = _masks(problem)
+    f = problem.start()[0]
+    is_row = _constraints(problem, real)
+    weight = 1.0 / is_row.sum(axis=(0, 1, 2))
+    lanes = f.shape[-1]
+    start = InteriorPointState(
+        f=f,
+        e=1.5 * jnp.abs(problem.forward(f)).max(axis=(0, 1, 2)) + 0.1,
+        plus=jnp.where(is_row, 0.5 * weight, 0.0),
+        minus=jnp.where(is_row, 0.5 * weight, 0.0),
+        z=jnp.where(free, weight, 0.0),
+        lower=jnp.zeros(lanes, f.dtype),
+        upper=jnp.full(lanes, jnp.inf, f.dtype),
+        steps=jnp.zeros(lanes, jnp.int32),
+        alive=jnp.ones(lanes, bool),
+    )
+    return _update_bounds(problem, start)
 
-    def is_done(state):
-        done = (state.upper - state.lower <= tolerance) | ~state.alive
-        if threshold is not None:
-            done |= (state.lower > threshold) | (state.upper <= threshold + tolerance)
-        return done | (state.steps >= max_iterations)
+
+def step(problem: HomomorphismProblem, state: InteriorPointState) -> InteriorPointState:
+    """One step of every lane."""
+    real, free = _masks(problem)
+    is_row = _constraints(problem, real)
+    masks = (is_row, is_row, free)
+    product = problem.forward(state.f)
+    # The three products y s. Where an entry does not exist, 1 stands in for its s and 0 for its y.
+    slacks = (state.e - product, state.e + product, state.f)
+    primal = tuple(jnp.where(mask, s, 1.0) for mask, s in zip(masks, slacks, strict=True))
+    dual = (state.plus, state.minus, state.z)
+    count = _total(mask.astype(state.e.dtype) for mask in masks)
+    direction = factorise(problem, is_row, free, *(y / s for y, s in zip(dual, primal, strict=True)))
+
+    def aim(goals):
+        """The Newton move towards y s = goal for the three products, and how far it can be followed."""
+        df, change, de, *new_dual = direction(*(goal / s for goal, s in zip(goals, primal, strict=True)))
+        d_primal = (jnp.where(is_row, de - change, 0.0), jnp.where(is_row, de + change, 0.0), df)
+        d_dual = tuple(new - old for new, old in zip(new_dual, dual, strict=True))
+        return (d_primal, d_dual, de), (_longest(primal, d_primal), _longest(dual, d_dual))
+
+    def products(move, steps):
+        moved = zip(primal, dual, *move[:2], strict=True)
+        return tuple((s + steps[0] * ds) * (y + steps[1] * dy) for s, y, ds, dy in moved)
+
+    mu = _total(y * s for y, s in zip(dual, primal, strict=True)) / count
+    predictor, steps = aim(tuple(jnp.zeros_like(y) for y in dual))
+    ahead = _total(products(predictor, steps)) / count
+    mu *= jnp.clip(ahead / mu, 0.0, 1.0) ** 3
+    second_order = (ds * dy for ds, dy in zip(*predictor[:2], strict=True))
+    goals = tuple(jnp.where(mask, mu - term, 0.0) for mask, term in zip(masks, second_order, strict=True))
+
+    def centre(_, best):
+        goals, move, steps = best
+        trial = products(move, tuple(jnp.minimum(1.0, 1.5 * length + 0.1) for length in steps))
+        goals = tuple(
+            goal + jnp.where(mask, _towards_centre(value, mu), 0.0)
+            for goal, value, mask in zip(goals, trial, masks, strict=True)
+        )
+        other = (goals, *aim(goals))
+        is_longer = sum(other[2]) > sum(steps)
+        return jax.tree.map(lambda new, old: jnp.where(is_longer, new, old), other, best)
+
+    _, move, steps = jax.lax.fori_loop(0, _CORRECTORS, centre, (goals, *aim(goals)))
+    moved = _follow(state, move, tuple(jnp.minimum(1.0, _TO_BOUNDARY * length) for length in steps))
+    return _update_bounds(problem, moved).replace(steps=state.steps + 1)
+
+
+def is_finished(state: InteriorPointState, tolerance, threshold, max_iterations) -> jax.Array:
+    """bool [lanes]: the bracket is tight enough, the threshold decided, or the lane cannot go on."""
+    finished = (state.upper - state.lower <= tolerance) | ~state.alive | (state.steps >= max_iterations)
+    if threshold is not None:
+        finished |= (state.lower > threshold) | (state.upper <= threshold + tolerance)
+    return finished
+
+
+SOLVER = Solver(init, step, is_finished)
+
+
+def solve(problem: HomomorphismProblem, *, tolerance, max_iterations: int = MAX_ITERATIONS) -> InteriorPointState:
+    """Steps until every lane has a bracket of the tolerance or cannot go on; finished lanes stay where they are."""
 
     def advance(state):
-        active = ~is_done(state)
-        moved = jax.vmap(_step)(*models, real, free, state)
-        moved = _bound(problem, moved)
-        state = jax.tree.map(lambda new, old: _where(active, new, old), moved, state)
-        return state.replace(steps=state.steps + active)
+        finished = is_finished(state, tolerance, None, max_iterations)
+        return jax.tree.map(lambda old, new: jnp.where(finished, old, new), state, step(problem, state))
 
-    start = _bound(problem, jax.vmap(_start, in_axes=(0, 0, 0, 0, 0))(*models, real, free, _first_map(problem)))
-    return jax.lax.while_loop(lambda state: jnp.any(~is_done(state)), advance, start)
+    def is_open(state):
+        return ~is_finished(state, tolerance, None, max_iterations).all()
 
-
-def _first_map(problem: HomomorphismProblem) -> jax.Array:
-    return jnp.moveaxis(problem.start()[0], -1, 0)
+    return jax.lax.while_loop(is_open, advance, init(problem))
 
 
-def _where(mask, new, old):
-    return jnp.where(mask.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+def _masks(problem: HomomorphismProblem) -> tuple[jax.Array, jax.Array]:
+    """bool [n, m, lanes]: which entries of f are real, and which of them are free."""
+    rows, columns = problem.masks((len(problem.source), len(problem.target)))
+    real = rows & columns
+    return real, real.at[0].set(False) if problem.anchored else real
 
 
-def _bound(problem: HomomorphismProblem, state: InteriorPointState) -> InteriorPointState:
+def _constraints(problem: HomomorphismProblem, real: jax.Array) -> jax.Array:
+    """bool [n, A, m, lanes]: the entries of K f that exist."""
+    n, m, lanes = real.shape
+    return jnp.broadcast_to(real[:, None], (n, problem.source.shape[1], m, lanes))
+
+
+def _update_bounds(problem: HomomorphismProblem, state: InteriorPointState) -> InteriorPointState:
     """Keeps the better of the bounds so far and those of the present f and y."""
-    f, y = jnp.moveaxis(state.f, 0, -1), jnp.moveaxis(state.plus - state.minus, 0, -1)
-    lower, upper = problem.bounds(f, y, problem.forward(f), problem.adjoint(y))
+    y = state.plus - state.minus
+    lower, upper = problem.bounds(state.f, y, problem.forward(state.f), problem.adjoint(y))
     return state.replace(lower=jnp.maximum(state.lower, lower), upper=jnp.minimum(state.upper, upper))
 
 
-def _start(source, target, real, free, f) -> InteriorPointState:
-    """Uniform f and y, e well above |K f|, and z = 1 on the free entries: strictly feasible."""
-    is_row = _constraints(real, source.shape[1])
-    y = is_row.astype(f.dtype) / (2.0 * is_row.sum())
-    zero = jnp.zeros((), f.dtype)
-    return InteriorPointState(
-        f=f,
-        e=1.5 * jnp.abs(plain_forward(source, target, f)).max() + 0.1,
-        plus=y,
-        minus=y,
-        z=jnp.where(free, 1.0 / is_row.sum(), 0.0),
-        lower=zero,
-        upper=zero + jnp.inf,
-        steps=jnp.zeros((), jnp.int32),
-        alive=jnp.asarray(True),
-    )
+def _towards_centre(value: jax.Array, mu: jax.Array) -> jax.Array:
+    """What a product y s lacks to be within `_CENTRED` of mu; large ones are not corrected by more than that."""
+    low, high = (factor * mu for factor in _CENTRED)
+    return jnp.maximum(jnp.clip(value, low, high) - value, -high)
 
 
-def _constraints(real: jax.Array, num_actions: int) -> jax.Array:
-    """bool [n, A, m]: the entries of K f that exist."""
-    n, m = real.shape
-    return jnp.broadcast_to(real[:, None], (n, num_actions, m))
-
-
-def _step(source, target, real, free, state: InteriorPointState) -> InteriorPointState:
-    """One predictor-corrector step of one lane."""
-    is_row = _constraints(real, source.shape[1])
-    f, e, plus, minus, z = state.f, state.e, state.plus, state.minus, state.z
-    product = plain_forward(source, target, f)
-    s_plus = jnp.where(is_row, e - product, 1.0)
-    s_minus = jnp.where(is_row, e + product, 1.0)
-    safe_f = jnp.where(free, f, 1.0)
-    mu = ((plus * s_plus + minus * s_minus).sum() + (z * safe_f).sum()) / (2 * is_row.sum() + free.sum())
-    direction = _newton(source, target, is_row, free, plus / s_plus, minus / s_minus, z / safe_f)
-
-    def solve(t_plus, t_minus, t_f):
-        """Moves towards y s = t, z f = t."""
-        df, de, q_plus, q_minus, q_z = direction(t_plus / s_plus, t_minus / s_minus, t_f / safe_f)
-        change = plain_forward(source, target, df)
-        ds_plus, ds_minus = jnp.where(is_row, de - change, 0.0), jnp.where(is_row, de + change, 0.0)
-        return (df, de, ds_plus, ds_minus), (q_plus - plus, q_minus - minus, q_z - z)
-
-    def reach(primal, dual):
-        df, _, ds_plus, ds_minus = primal
-        primal_step = _longest([(s_plus, ds_plus), (s_minus, ds_minus), (safe_f, df)])
-        return primal_step, _longest(list(zip((plus, minus, z), dual, strict=True)))
-
-    zero_y, zero_f = jnp.zeros_like(plus), jnp.zeros_like(f)
-    primal, dual = solve(zero_y, zero_y, zero_f)
-    step_p, step_d = reach(primal, dual)
-    df, _, ds_plus, ds_minus = primal
-    left = ((plus + step_d * dual[0]) * (s_plus + step_p * ds_plus)).sum() - (plus * s_plus * ~is_row).sum()
-    left += ((minus + step_d * dual[1]) * (s_minus + step_p * ds_minus)).sum()
-    left += ((z + step_d * dual[2]) * (safe_f + step_p * df)).sum()
-    ahead = left / (2 * is_row.sum() + free.sum())
-    target_mu = mu * jnp.clip(ahead / mu, 0.0, 1.0) ** 3
-    t_plus = jnp.where(is_row, target_mu - ds_plus * dual[0], 0.0)
-    t_minus = jnp.where(is_row, target_mu - ds_minus * dual[1], 0.0)
-    t_f = jnp.where(free, target_mu - df * dual[2], 0.0)
-    primal, dual = solve(t_plus, t_minus, t_f)
-    step_p, step_d = (jnp.minimum(1.0, _TO_BOUNDARY * step) for step in reach(primal, dual))
+def _follow(state: InteriorPointState, move, steps) -> InteriorPointState:
+    """The state after a step, or the old one, no longer alive, if that is not finite."""
+    (_, _, df), (d_plus, d_minus, dz), de = move
     moved = state.replace(
-        f=f + step_p * primal[0],
-        e=e + step_p * primal[1],
-        plus=plus + step_d * dual[0],
-        minus=minus + step_d * dual[1],
-        z=z + step_d * dual[2],
+        f=state.f + steps[0] * df,
+        e=state.e + steps[0] * de,
+        plus=state.plus + steps[1] * d_plus,
+        minus=state.minus + steps[1] * d_minus,
+        z=state.z + steps[1] * dz,
     )
     values = (moved.f, moved.e, moved.plus, moved.minus, moved.z)
-    is_finite = jnp.all(jnp.stack([jnp.isfinite(value).all() for value in values]))
+    is_finite = jnp.stack([jnp.isfinite(value).all(axis=tuple(range(value.ndim - 1))) for value in values]).all(axis=0)
     kept = jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), moved, state)
     return kept.replace(alive=state.alive & is_finite)
 
 
-def _longest(pairs) -> jax.Array:
-    """Largest step in [0, 1 / _TO_BOUNDARY] that keeps every value + step * change non-negative."""
-
-    def limit(value, change):
-        shrinks = change < 0
-        return jnp.where(shrinks, -value / jnp.where(shrinks, change, -1.0), jnp.inf).min()
-
-    limits = [limit(value, change) for value, change in pairs]
-    return jnp.minimum(jnp.stack(limits).min(), 1.0 / _TO_BOUNDARY)
+def _total(arrays) -> jax.Array:
+    """Sums of all entries, per lane."""
+    return sum(array.sum(axis=tuple(range(array.ndim - 1))) for array in arrays)
 
 
-def _newton(source, target, is_row, free, d_plus, d_minus, d_f):
-    """Factorises the Newton system of one lane; returns the map from y s and z f targets to the directions."""
-    n, m = free.shape
-    d_plus, d_minus = jnp.where(is_row, d_plus, 0.0), jnp.where(is_row, d_minus, 0.0)
-    flat_free = free.ravel()
-    normal = _normal_matrix(source, target, d_plus + d_minus) + jnp.diag(jnp.where(free, d_f, 1.0).ravel())
-    normal = jnp.where(flat_free[:, None] & flat_free, normal, jnp.eye(n * m, dtype=normal.dtype))
-    normal = jnp.where(jnp.eye(n * m, dtype=bool) & ~flat_free, 1.0, normal)
-    factor = jnp.linalg.cholesky(normal)
-    row_of = jnp.repeat(jnp.eye(n, dtype=normal.dtype), m, axis=0) * flat_free[:, None]  # E^T, [nm, n]
-    coupling = jnp.where(flat_free, plain_adjoint(source, target, d_plus - d_minus).ravel(), 0.0)
-    has_row = free.any(axis=1)
-
-    def solve_normal(right):
-        return jax.scipy.linalg.cho_solve((factor, True), right)
-
-    columns = jnp.concatenate([row_of, coupling[:, None]], axis=1)  # [nm, n + 1]
-    inverse = solve_normal(columns)
-    border = columns.T @ inverse
-    border = border.at[n, n].add(-(d_plus + d_minus).sum())
-    keep = jnp.append(has_row, True)
-    border = jnp.where(keep[:, None] & keep, border, jnp.eye(n + 1, dtype=border.dtype))
-
-    def direction(r_plus, r_minus, r_f):
-        """Targets divided by s+, s- and f; returns df, de and the new y+, y-, z."""
-        r_plus, r_minus = jnp.where(is_row, r_plus, 0.0), jnp.where(is_row, r_minus, 0.0)
-        pull = jnp.where(free, r_f - plain_adjoint(source, target, r_plus - r_minus), 0.0).ravel()
-        base = solve_normal(pull)
-        right = -(columns.T @ base)
-        right = right.at[n].add(1.0 - (r_plus + r_minus).sum())
-        multipliers = jnp.linalg.solve(border, jnp.where(keep, right, 0.0))
-        df = (base + inverse @ multipliers).reshape(n, m)
-        de = multipliers[n]
-        change = plain_forward(source, target, df)
-        new_plus = jnp.where(is_row, r_plus - d_plus * (de - change), 0.0)
-        new_minus = jnp.where(is_row, r_minus - d_minus * (de + change), 0.0)
-        return df, de, new_plus, new_minus, jnp.where(free, r_f - d_f * df, 0.0)
-
-    return direction
-
-
-def _normal_matrix(source, target, weight) -> jax.Array:
-    """K^T diag(weight) K, [nm, nm], from contractions of the two models."""
-    n, m = source.shape[0], target.shape[0]
-    same_column = jnp.einsum("iak,iaj,iap->kjp", weight, source, source)
-    same_row = jnp.einsum("jak,lak,qak->jlq", weight, target, target)
-    # Row (i, a, k) meets f(j, k) with T(i,a,j) and f(i, q) with -T'(q,a,k).
-    cross = jnp.einsum("iak,iaj,qak->jkiq", weight, source, target)
-    matrix = jnp.einsum("kjp,kq->jkpq", same_column, jnp.eye(m, dtype=weight.dtype))
-    matrix += jnp.einsum("jlq,jp->jlpq", same_row, jnp.eye(n, dtype=weight.dtype))
-    matrix -= cross + jnp.transpose(cross, (2, 3, 0, 1))
-    return matrix.reshape(n * m, n * m)
+def _longest(values, changes) -> jax.Array:
+    """Largest steps [lanes] in [0, 1 / _TO_BOUNDARY] that keep every value + step * change non-negative."""
+    shrinking = [
+        jnp.where(change < 0, -change / value, 0.0).max(axis=tuple(range(value.ndim - 1)))
+        for value, change in zip(values, changes, strict=True)
+    ]
+    return 1.0 / jnp.maximum(jnp.stack(shrinking).max(axis=0), _TO_BOUNDARY)

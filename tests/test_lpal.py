@@ -172,7 +172,6 @@ def test_a_batch_agrees_with_its_lanes_alone():
         alone = lpal(here.mdp, expectations, tolerance=1e-4)
         assert_solved(alone, here.arrays, expectations, 1e-4)
         np.testing.assert_allclose(batch.margin[i], alone.margin, rtol=0, atol=1e-4)
-        assert batch.iterations[i] >= alone.iterations
 
 
 @pytest.mark.parametrize("method", METHODS)

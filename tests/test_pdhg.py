@@ -13,7 +13,8 @@ import small_models
 from jaxopt.projection import projection_l1_ball, projection_simplex
 from scipy.optimize import linprog
 
-from jaxhom.pdhg import Status, engine, projections, solve_many
+from jaxhom.lane_queue import solve_many
+from jaxhom.pdhg import SOLVER, PDHGState, Status, engine, projections
 from jaxhom.pdhg.flow_lp import FlowProblem
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem, plain_adjoint, plain_forward
 from jaxhom.pdhg.matrix_game import MatrixGame
@@ -592,13 +593,18 @@ def lanes_of(problem, index):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., index], problem)
 
 
+def run_queue(problem, **options):
+    """The queue's answers as a state."""
+    return PDHGState(**solve_many(SOLVER, problem, **options))
+
+
 @pytest.mark.parametrize("total", [1, 5, 16, 39])
 def test_many_problems_through_sixteen_lanes(total):
     """Fewer and more problems than lanes, in any order: each gets its own answer."""
     problem, values = pairs()
     order = np.random.default_rng(total).permutation(np.resize(np.arange(16), total))
     finished, tolerance = [], 1e-4
-    state = solve_many(lanes_of(problem, order), tolerance=tolerance, lanes=16, progress=finished.append)
+    state = run_queue(lanes_of(problem, order), tolerance=tolerance, lanes=16, progress=finished.append)
     assert sum(finished) == total
     chex.assert_shape([state.lower, state.upper, state.steps], (total,))
     chex.assert_shape([state.best_primal, state.best_dual], [(3, 3, total), (3, 2, 3, total)])
@@ -610,7 +616,7 @@ def test_many_problems_through_sixteen_lanes(total):
 def test_many_problems_agree_with_each_alone():
     """Lanes that are refilled see nothing of their predecessors: as many steps alone give the same points."""
     problem, _ = pairs()
-    state = solve_many(lanes_of(problem, np.resize(np.arange(16), 40)), tolerance=1e-4, lanes=16)
+    state = run_queue(lanes_of(problem, np.resize(np.arange(16), 40)), tolerance=1e-4, lanes=16)
     for i in (0, 4, 17, 25, 30, 39):
         alone = solve(lanes_of(problem, [i % 16]), -1.0, state.steps[i])
         for field in ("steps", "lower", "upper", "best_primal", "best_dual"):
@@ -623,16 +629,16 @@ def test_many_problems_with_a_threshold():
     threshold = np.maximum(values + np.resize([0.05, -0.05], 16), 0.0)
     is_similar = values <= threshold
     assert 4 < is_similar.sum() < 12
-    state = solve_many(problem, tolerance=1e-6, threshold=threshold, lanes=16)
+    state = run_queue(problem, tolerance=1e-6, threshold=threshold, lanes=16)
     np.testing.assert_array_equal(state.upper <= threshold + 1e-6, is_similar)
     np.testing.assert_array_equal(state.lower > threshold, ~is_similar)
-    exact = solve_many(problem, tolerance=1e-6, lanes=16)
+    exact = run_queue(problem, tolerance=1e-6, lanes=16)
     assert np.median(state.steps) < np.median(exact.steps)
 
 
 def test_many_problems_out_of_iterations():
     problem, values = pairs()
-    state = solve_many(problem, tolerance=1e-9, max_iterations=32, lanes=16)
+    state = run_queue(problem, tolerance=1e-9, max_iterations=32, lanes=16)
     assert np.all(state.steps <= 32)
     assert_brackets(state, values)
     settled = engine.is_settled(state, 1e-9)
@@ -660,11 +666,11 @@ def test_other_problems_of_one_shape_are_not_traced_again(rng):
         sizes = np.full(total, 2, np.int32)
         return CountingProblem(source=source, target=target, source_size=sizes, target_size=sizes, anchored=False)
 
-    solve_many(problems(20), tolerance=1e-3, lanes=8)
+    run_queue(problems(20), tolerance=1e-3, lanes=8)
     traced = len(_traces)
     assert traced > 0
-    solve_many(problems(30), tolerance=1e-5, lanes=8, max_iterations=500)
-    solve_many(problems(2), tolerance=1e-3, lanes=8)
+    run_queue(problems(30), tolerance=1e-5, lanes=8, max_iterations=500)
+    run_queue(problems(2), tolerance=1e-3, lanes=8)
     assert len(_traces) == traced
 
 

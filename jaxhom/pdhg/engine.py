@@ -26,6 +26,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxhom.lane_queue import Solver
 from jaxhom.pdhg.projections import reduce_leading
 
 _SUFFICIENT_DECAY = 0.2  # restart at once
@@ -186,8 +187,7 @@ def solve(
     lanes = state.lower.shape[-1]
 
     def keep_going(state):
-        done = is_settled(state, tolerance, threshold) | (state.steps >= max_iterations)
-        return done.sum() < jnp.ceil(stop_fraction * lanes)
+        return is_finished(state, tolerance, threshold, max_iterations).sum() < jnp.ceil(stop_fraction * lanes)
 
     return jax.lax.while_loop(keep_going, lambda s: step(problem, s), state)
 
@@ -198,6 +198,14 @@ def is_settled(state: PDHGState, tolerance, threshold=None) -> jax.Array:
     if threshold is None:
         return settled
     return settled | (state.lower > threshold) | (state.upper <= threshold + tolerance)
+
+
+def is_finished(state: PDHGState, tolerance, threshold, max_iterations) -> jax.Array:
+    """[lanes]: settled, or out of iterations."""
+    return is_settled(state, tolerance, threshold) | (state.steps >= max_iterations)
+
+
+SOLVER = Solver(init, step, is_finished)
 
 
 def _iterate(problem: Problem, state: PDHGState, k):

@@ -6,7 +6,6 @@ time is the median of three calls after a first one that compiles; `compile_s` i
 """
 
 import argparse
-import concurrent.futures
 import functools
 import json
 import statistics
@@ -23,7 +22,7 @@ import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
 from bench import peers  # noqa: E402
-from jaxhom.brackets import bracket_errors  # noqa: E402
+from jaxhom.brackets import MAX_INTERIOR_SIZE, bracket_errors  # noqa: E402
 from jaxhom.generalization import GlobalHomomorphismProblem, restricted_model  # noqa: E402
 from jaxhom.homomorphism import ClassSimilarity  # noqa: E402
 from jaxhom.local_models import local_model_classes  # noqa: E402
@@ -38,6 +37,8 @@ SIZES = (3, 5, 8, 13, 25)
 OUR_PAIRS = {3: 2048, 5: 2048, 8: 512, 13: 128, 25: 32}
 PEER_PAIRS = {3: 512, 5: 512, 8: 128, 13: 48, 25: 4}
 MPAX_PAIRS = {3: 64, 5: 64, 8: 32, 13: 8}  # larger ones take minutes
+OUR_COUNTS = (1, 8, 64, 512, 4096, 32768)
+PEER_COUNTS = (1, 8, 64, 512)
 _HIGHS_SECONDS = 300.0
 
 # --------------------------------------------------------------------------------------------------- rows and timing
@@ -132,26 +133,17 @@ def judged(lower, upper, *, threshold: float | None = None) -> dict:
 # --------------------------------------------------------------------------------------------- random pairs, our side
 
 
-def our_pairs(n: int, count: int, method: str, dtype=np.float64, threshold=None, threads: int = 1) -> dict:
-    """Brackets or decisions of random pairs; several threads each take a share."""
+def our_pairs(n: int, count: int, method: str, dtype=np.float64, threshold=None, work="brackets") -> dict:
+    """Brackets or decisions of random pairs."""
     source, target = random_pairs(n, count, dtype)
-    shares = np.array_split(np.arange(count), threads)
-
-    def solve(share):
-        return bracket_errors(source[share], target[share], tolerance=GAP, threshold=threshold, method=method)
 
     def call():
-        if threads == 1:
-            return [solve(shares[0])]
-        with concurrent.futures.ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(solve, shares))
+        return bracket_errors(source, target, tolerance=GAP, threshold=threshold, method=method)
 
-    parts, compile_s, seconds = timed(call)
-    lower, upper = (np.concatenate([getattr(part, side) for part in parts]) for side in ("lower", "upper"))
-    work = "brackets" if threshold is None else "decisions"
-    name = f"jaxhom {method}" + (f", {threads} threads" if threads > 1 else "")
+    found, compile_s, seconds = timed(call)
     fields = {"n": n, "m": n, "actions": NUM_ACTIONS, "dtype": np.dtype(dtype).name, "compile_s": compile_s}
-    return row(work, name, count, seconds, **fields, **judged(lower, upper, threshold=threshold))
+    fields |= judged(found.lower, found.upper, threshold=threshold)
+    return row(work, f"jaxhom {method}", count, seconds, **fields)
 
 
 def section_brackets(quick: bool) -> list[dict]:
@@ -160,11 +152,16 @@ def section_brackets(quick: bool) -> list[dict]:
     for n in (3, 5) if quick else SIZES:
         count = 8 if quick else OUR_PAIRS[n]
         rows += [our_pairs(n, count, "pdhg"), our_pairs(n, count, "pdhg", np.float32)]
-        if jax.device_count() > 1:
-            continue  # the interior-point method runs on one device
-        rows.append(our_pairs(n, count, "interior_point"))
-        rows.append(our_pairs(n, count, "interior_point", threads=2))
-        rows.append(our_pairs(n, count, "auto"))
+        if n <= MAX_INTERIOR_SIZE:
+            rows.append(our_pairs(n, count, "interior_point"))
+    return rows
+
+
+def section_counts(quick: bool) -> list[dict]:
+    """Random pairs of five states, few and many."""
+    rows = [our_pairs(5, count, "auto", work="counts") for count in ((8,) if quick else OUR_COUNTS)]
+    for method in ("highs_simplex", "moreau"):
+        rows += [peer_pairs(method, 5, count, "counts") for count in (() if quick else PEER_COUNTS)]
     return rows
 
 
@@ -172,7 +169,7 @@ def section_decisions(quick: bool) -> list[dict]:
     """e <= 0.05 for random pairs of five states."""
     count = 8 if quick else OUR_PAIRS[5]
     dtypes = (np.float64, np.float32)
-    return [our_pairs(5, count, "auto", dtype, threshold=THRESHOLD) for dtype in dtypes]
+    return [our_pairs(5, count, "auto", dtype, THRESHOLD, "decisions") for dtype in dtypes]
 
 
 def section_gradients(quick: bool) -> list[dict]:
@@ -208,20 +205,19 @@ def _moreau_gradients(source, target, exact, fields) -> dict:
 # -------------------------------------------------------------------------------------------------------------- peers
 
 
-def peer_pairs(method: str, n: int, count: int) -> dict:
+def peer_pairs(method: str, n: int, count: int, work: str = "brackets") -> dict:
     """Brackets of random pairs by a peer, certified by us."""
     fields = {"n": n, "m": n, "actions": NUM_ACTIONS, "device": "cpu"}
     if not peers.is_installed(method):
-        return row("brackets", method, 0, **fields, status="not installed")
+        return row(work, method, 0, **fields, status="not installed")
     source, target = random_pairs(n, count)
     try:
         answer = peers.solve_pairs(method, source, target, GAP)
     except Exception as error:  # a peer that fails is a row, not the end of the benchmark
-        return row("brackets", method, count, **fields, status="failed", note=f"{type(error).__name__}: {error}")
+        return row(work, method, count, **fields, status="failed", note=f"{type(error).__name__}: {error}")
     fields |= {"processes": answer.processes, "compile_s": answer.compile_s, "build_s": answer.build_s}
-    return row(
-        "brackets", method, count, answer.seconds, **fields, **judged(*certify(source, target, answer.f, answer.y))
-    )
+    fields |= judged(*certify(source, target, answer.f, answer.y))
+    return row(work, method, count, answer.seconds, **fields)
 
 
 def section_peers(quick: bool) -> list[dict]:

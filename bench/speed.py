@@ -10,7 +10,6 @@ section runs in a process of its own (see `bench.similarity_speed`).
 import argparse
 import csv
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -20,30 +19,24 @@ FIELDS = (
     *("gap_certified", "settled", "compile_s", "build_s", "seconds", "ms_per_pair", "gflops", "peak_fraction"),
     *("gbytes_per_s", "status", "note", "versions", "commit"),
 )
-# Section, number of XLA host devices.
 SIMILARITY = (
-    *(("peak", 1), ("brackets", 1), ("brackets", 2), ("decisions", 1), ("decisions", 2), ("gradients", 1)),
-    *(("peers", 1), ("racetrack", 1), ("racetrack", 2), ("algorithm1", 1), ("algorithm1", 2)),
-    *(("global", 1), ("global_large", 1)),
+    *("peak", "brackets", "counts", "decisions", "gradients", "peers"),
+    *("racetrack", "algorithm1", "global", "global_large"),
 )
-QUICK = (("brackets", 1), ("decisions", 1), ("gradients", 1), ("peers", 1))
+QUICK = ("brackets", "decisions", "gradients", "peers")
 _MIN_SETTLED = 0.98
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 _MARKERS = "osD^vP*X"
 
 
-def run_section(section: str, devices: int, quick: bool) -> list[dict]:
+def run_section(section: str, quick: bool) -> list[dict]:
     """Rows of one section, measured in a process of its own; a section that fails is a row too."""
-    environment = dict(os.environ)
-    if devices > 1:
-        flag = f"--xla_force_host_platform_device_count={devices}"
-        environment["XLA_FLAGS"] = f"{environment.get('XLA_FLAGS', '')} {flag}".strip()
     command = [sys.executable, "-m", "bench.similarity_speed", section] + ["--quick"] * quick
-    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
     rows = [json.loads(line[4:]) for line in found.stdout.splitlines() if line.startswith("ROW ")]
     if found.returncode:
         reason = (found.stderr.strip().splitlines() or ["no message"])[-1]
-        rows.append({"work": section, "devices": devices, "status": "failed", "note": reason})
+        rows.append({"work": section, "status": "failed", "note": reason})
     return rows
 
 
@@ -137,38 +130,44 @@ def _peak_table(rows: list[dict]) -> list[str]:
     return [*lines, ""]
 
 
-def curves(rows: list[dict]) -> dict[str, list[tuple[int, float]]]:
-    """For each method, (n, ms per pair) of the brackets in float64, the best over the numbers of devices."""
-    found: dict[str, dict[int, float]] = {}
+def curves(rows: list[dict], work: str, by: str) -> dict[str, list[tuple[int, float]]]:
+    """For each method and type, (rows' `by`, ms per pair)."""
+    found: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
-        if row["work"] == "brackets" and row["status"] == "measured" and row["dtype"] == "float64":
-            points = found.setdefault(row["method"], {})
-            n = int(row["n"])
-            points[n] = min(points.get(n, float("inf")), float(row["ms_per_pair"]))
-    return {method: sorted(points.items()) for method, points in found.items() if method != "jaxhom auto"}
+        if row["work"] == work and row["status"] == "measured" and (_number(row, "settled") or 0.0) >= _MIN_SETTLED:
+            name = row["method"].replace("_", " ") + (", float32" if row["dtype"] == "float32" else "")
+            found.setdefault(name, []).append((int(row[by]), float(row["ms_per_pair"])))
+    return {name: sorted(points) for name, points in found.items()}
 
 
 def plot(rows: list[dict], path: pathlib.Path) -> None:
-    """Time per pair against the size of the models, both axes logarithmic."""
+    """Time per pair against the size of the models and against the number of pairs, all axes logarithmic."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
-    for k, (method, points) in enumerate(curves(rows).items()):
-        line = "-" if method.startswith("jaxhom") else "--"
-        style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "linestyle": line}
-        axes.loglog(*zip(*points, strict=True), label=method.replace("_", " "), **style)
-    sizes = sorted({n for points in curves(rows).values() for n, _ in points})
-    axes.set_xticks(sizes, [str(n) for n in sizes])
-    axes.minorticks_off()
-    axes.set_xlabel("states of each model (n = m), 4 actions")
-    axes.set_ylabel("milliseconds per pair")
-    axes.set_title("Certified brackets of 1e-4, random pairs, two cores")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper left")
-    figure.savefig(path, dpi=150)
+    panels = (
+        ("brackets", "n", "states of each model (n = m)", "the more states"),
+        ("counts", "pairs", "pairs of five states", "the more pairs"),
+    )
+    styles: dict[str, dict] = {}
+    figure, all_axes = plt.subplots(1, 2, figsize=(10.4, 4.4), layout="constrained", sharey=True)
+    for axes, (work, by, label, title) in zip(all_axes, panels, strict=True):
+        for name, points in curves(rows, work, by).items():
+            k = len(styles)
+            line = "-" if name.startswith("jaxhom") else "--"
+            style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "linestyle": line}
+            axes.loglog(*zip(*points, strict=True), label=name, **styles.setdefault(name, style))
+        ticks = sorted({at for points in curves(rows, work, by).values() for at, _ in points})
+        axes.set_xticks(ticks, [str(at) for at in ticks])
+        axes.minorticks_off()
+        axes.set(xlabel=label, title=title)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    all_axes[0].set_ylabel("milliseconds per pair")
+    figure.suptitle("Certified brackets of 1e-4, random pairs with 4 actions, two cores")
+    figure.savefig(path, dpi=130)
     plt.close(figure)
 
 
@@ -176,7 +175,7 @@ def report(path: pathlib.Path) -> None:
     """The table and the figure of the rows in a CSV file, beside it."""
     rows = read(path)
     path.with_suffix(".md").write_text(table(rows))
-    if curves(rows):
+    if curves(rows, "brackets", "n"):
         plot(rows, path.with_suffix(".png"))
 
 
@@ -184,11 +183,11 @@ def similarity(arguments: argparse.Namespace) -> None:
     """Measures, writes rows after every section, and reports."""
     if not arguments.report:
         rows: list[dict] = []
-        for section, devices in QUICK if arguments.quick else SIMILARITY:
+        for section in QUICK if arguments.quick else SIMILARITY:
             if arguments.sections and section not in arguments.sections:
                 continue
-            print(f"{section}, {devices} device(s)", file=sys.stderr, flush=True)
-            rows += run_section(section, devices, arguments.quick)
+            print(section, file=sys.stderr, flush=True)
+            rows += run_section(section, arguments.quick)
             write(arguments.output, rows)
     report(arguments.output)
 
@@ -199,7 +198,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("similarity", help="local and global homomorphisms, against other LP solvers")
     command.add_argument("--quick", action="store_true", help="a handful of pairs, to see that it runs")
-    command.add_argument("--sections", nargs="+", choices=sorted({name for name, _ in SIMILARITY}), help="only these")
+    command.add_argument("--sections", nargs="+", choices=SIMILARITY, help="only these")
     command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
     command.add_argument("--output", type=pathlib.Path, default=pathlib.Path("bench/results/speed_similarity.csv"))
     command.set_defaults(run=similarity)

@@ -21,7 +21,7 @@ METHODS = ("auto", "pdhg", "interior_point")
 _MAX_LANES = 64
 _BATCH_BYTES = 32 * 2**20
 _CHUNK_PAIRS = 16_384
-_MAX_INTERIOR_SIZE = 16  # larger models: the normal matrix, (n m)^2, is slower than PDHG
+MAX_INTERIOR_SIZE = 16  # larger models: the normal matrix, (n m)^2, is slower than PDHG
 _INTERIOR_BYTES = 4 * 2**20
 
 
@@ -129,7 +129,7 @@ def suits_interior_point(source: jax.Array, target: jax.Array, tolerance: float)
     Args:
       source: [n, ...]. target: [m, ...].
     """
-    is_small = max(source.shape[0], target.shape[0]) <= _MAX_INTERIOR_SIZE
+    is_small = max(source.shape[0], target.shape[0]) <= MAX_INTERIOR_SIZE
     return is_small and tolerance <= 1e-3 and source.dtype == np.float64 and jax.default_backend() == "cpu"
 
 

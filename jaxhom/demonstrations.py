@@ -111,13 +111,13 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Arra
     """
     demonstrations.validate(mdp)
     shape = (mdp.num_states, mdp.num_actions)
-    # Counted in integers: float32 would stop counting at 2^24.
+    # Counted in integers and divided in JAX's default type: float32 would stop counting at 2^24, float16 at 2^11.
     weight = demonstrations.mask.astype(jnp.int32)
-    counts = jnp.zeros(shape, jnp.int32).at[demonstrations.states, demonstrations.actions].add(weight).astype(mdp.dtype)
+    counts = jnp.zeros(shape, jnp.int32).at[demonstrations.states, demonstrations.actions].add(weight).astype(float)
     visits = counts.sum(axis=-1, keepdims=True)
     visited = visits[:, 0] > 0
-    uniform = 1.0 / mdp.num_actions
-    return visited, jnp.where(visited[:, None], counts / jnp.maximum(visits, 1.0), uniform)
+    frequencies = (counts / jnp.maximum(visits, 1.0)).astype(mdp.dtype)
+    return visited, jnp.where(visited[:, None], frequencies, 1.0 / mdp.num_actions)
 
 
 def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> jax.Array:

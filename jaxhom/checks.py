@@ -5,6 +5,7 @@ code never checks values. Shapes are reported as expected against actual.
 """
 
 import operator
+import reprlib
 
 import jax
 import numpy as np
@@ -29,6 +30,11 @@ def as_host_array(name: str, value) -> np.ndarray:
 def is_traced(*trees) -> bool:
     """True if any leaf of the given pytrees is a traced value (host checks are then impossible)."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def in_one_line(value) -> str:
+    """`repr` for messages: without line breaks, and cut off where it is long."""
+    return " ".join(reprlib.repr(value).split())
 
 
 def require_shape(name: str, array, expected: str, condition: bool) -> None:
@@ -69,7 +75,7 @@ def require_integers(name: str, array: np.ndarray, upper: int | None = None) -> 
     """Returns `array` as int64 with every entry in [0, upper); floats that are whole numbers are accepted."""
     if array.dtype.kind == "f":
         require_all(name, array, np.isfinite(array) & (array == np.floor(array)), "must be whole")
-        require_all(name, array, np.abs(array) < 2**53, "is too large for an index")
+        require_all(name, array, np.abs(array.astype(np.float64)) < 2**53, "is too large for an index")
     elif array.dtype.kind not in "iu":
         raise ValueError(f"{name} must hold integers, got dtype {array.dtype}")
     require_all(name, array, array >= 0, "must not be negative")
@@ -110,7 +116,7 @@ def require_count(name: str, value) -> int:
     try:
         value = operator.index(value)
     except TypeError:
-        raise ValueError(f"{name} must be a whole number, got {value!r}") from None
+        raise ValueError(f"{name} must be a whole number, got {in_one_line(value)}") from None
     if value < 1:
         raise ValueError(f"{name} must be at least 1, got {value}")
     return value

@@ -196,6 +196,7 @@ GOOD = {0: {0: [(1.0, 1, 0.0, True)]}, 1: {0: [(1.0, 1, 0.0, True)]}}
         (toy({0: GOOD[0], 1: {0: GOOD[1][0], 1: GOOD[1][0]}}), r"P\[1\] has 2 actions, but P\[0\] has 1"),
         (toy(3), r"as P\[state\]\[action\]"),
         (toy({**GOOD, 0: {0: [0.5, 0.5]}}), r"P\[0\]\[0\]\[0\] must be \(probability, next state, .*got 0.5"),
+        (toy({**GOOD, 0: {0: [np.eye(3)]}}), r"P\[0\]\[0\]\[0\] must be"),
         (toy({**GOOD, 0: {0: [(1.0, 1, 0.0)]}}), r"P\[0\]\[0\]\[0\] must be"),
         (toy({**GOOD, 0: {0: [(1.0, "left", 0.0, True)]}}), r"P\[0\]\[0\]\[0\] must be"),
         (toy({**GOOD, 0: {0: []}}), r"sum of P: probability\[0, 0\] must be 1, got 0"),

@@ -107,6 +107,7 @@ def test_to_states_sees_observations_as_they_are_stored():
     [
         (([], []), "it has no actions"),
         (([4], []), "it has no actions"),
+        (([4], np.zeros(0, complex)), "it has no actions"),
         (([0, 1, 2], [0]), "1 actions need as many observations or one more, got 3"),
         (([0], [0, 1]), "2 actions need as many observations or one more, got 1"),
         (([0.5, 1], [0]), "observations[0] must be whole, got 0.5"),
@@ -242,8 +243,9 @@ def test_csv_lines_without_action_are_final_observations(read):
     ("text", "message"),
     [
         ("", "line 1: column 'episode' is missing; the first line must name the columns, got nothing"),
-        ("0,0,1\n", "line 1: column 'episode' is missing; the first line must name the columns, got 0, 0, 1"),
+        ("0,0,1\n", "line 1: column 'episode' is missing; the first line must name the columns, got '0', '0', '1'"),
         ("episode;state;action\n", "column 'episode' is missing"),
+        ('"epi\nsode",state,action\n', "column 'episode' is missing"),
         ("episode,state\n0,0\n", "line 1: column 'action' is missing"),
         ("episode,state,state,action\n", "line 1: column 'state' occurs twice"),
         ("episode,state,action\n", "there are no episodes"),

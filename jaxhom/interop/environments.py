@@ -136,7 +136,8 @@ def _entries(rows: list[list]) -> np.ndarray:
                     entries[s, a, i] = probability, next_state, reward, terminated
                 except (TypeError, ValueError):
                     expected = "(probability, next state, reward, terminated)"
-                    raise ValueError(f"P[{s}][{a}][{i}] must be {expected}, got {outcome!r}") from None
+                    got = checks.in_one_line(outcome)
+                    raise ValueError(f"P[{s}][{a}][{i}] must be {expected}, got {got}") from None
     return entries
 
 

@@ -132,8 +132,8 @@ def from_samples(
 
 
 def _validated_prior(prior, support: str) -> float:
-    if support not in SUPPORTS:
-        raise ValueError(f"support must be one of {', '.join(SUPPORTS)}, got {support!r}")
+    if not isinstance(support, str) or support not in SUPPORTS:
+        raise ValueError(f"support must be one of {', '.join(SUPPORTS)}, got {checks.in_one_line(support)}")
     prior = checks.require_floats("prior", checks.as_host_array("prior", prior))
     checks.require_shape("prior", prior, "()", prior.ndim == 0)
     if prior < 0 or (prior == 0 and support == "all"):

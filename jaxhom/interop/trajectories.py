@@ -207,7 +207,7 @@ def _column(name: str, values) -> np.ndarray:
     if array.ndim != 1:
         raise ValueError(f"{name} must have shape [H] or [H, 1], got {array.shape}{remedy}")
     if not array.size:  # an empty list has no type of its own
-        return array.astype(np.int64)
+        return np.zeros(0, np.int64)
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name} must be whole numbers, got dtype {array.dtype}{remedy}")
     return array
@@ -232,7 +232,7 @@ def _places(path, header: list[str]) -> list[int]:
     for column in COLUMNS:
         if names.count(column) != 1:
             how = "is missing" if column not in names else "occurs twice"
-            found = ", ".join(names) or "nothing"
+            found = ", ".join(map(repr, names)) or "nothing"
             raise FileError(
                 f"{path} line 1: column {column!r} {how}; the first line must name the columns, got {found}"
             )

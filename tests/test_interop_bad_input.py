@@ -250,7 +250,7 @@ def test_sampled_rows_are_distributions_with_the_mode_of_the_counts(data, num_st
         if counts[s, a].any():
             assert np.all(np.diff(transition[s, a, order]) >= -1e-15)
     l1, deviation = np.asarray(model.expected_l1_error), np.asarray(model.standard_deviation)
-    assert np.all((l1 >= -1e-12) & (l1 <= 2.0)) and np.all(deviation <= np.sqrt(2.0))
+    assert np.all((l1 >= 0.0) & (l1 <= 2.0)) and np.all(deviation <= np.sqrt(2.0))
     # Norms: |x|_2^2 <= |x|_1^2 <= 2 |x|_1 here, and |x|_1 <= sqrt(classes) |x|_2.
     assert np.all(deviation**2 <= 2.0 * l1 + 1e-9) and np.all(l1 <= np.sqrt(num_states + 1) * deviation + 1e-9)
 

@@ -2,6 +2,7 @@
 
 import collections
 import re
+import sys
 import types
 
 import gymnasium
@@ -214,6 +215,13 @@ def test_environments_that_are_refused(env, message):
     with pytest.raises(ValueError, match=message) as raised:
         from_gymnasium(env, discount=DISCOUNT)
     assert "\n" not in str(raised.value)
+
+
+def test_without_gymnasium_an_id_says_what_to_install_and_an_environment_needs_nothing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(ImportError, match=r"pip install 'jaxhom\[interop\]'"):
+        from_gymnasium("FrozenLake-v1", discount=DISCOUNT)
+    assert from_gymnasium(toy(GOOD), discount=DISCOUNT).mdp.num_states == 2
 
 
 def test_features_of_the_wrong_shape_are_refused():

@@ -177,7 +177,7 @@ def _errors(pair, seen, count, kinds, num_states: int, prior: float, support: st
         return np.zeros((2, len(count)))
     if support == "observed":  # nothing is known of such a row: as far off as two distributions can be
         l1, square = np.where(count == 0, 2.0, l1), np.where(count == 0, 2.0, square)
-    return l1, square
+    return np.clip(l1, 0.0, 2.0), square  # but for rounding it lies there
 
 
 def _beta_errors(weight, total, centre):

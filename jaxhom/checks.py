@@ -4,8 +4,13 @@ The checks run in NumPy on concrete arrays, in the constructors and at the doors
 code never checks values. Shapes are reported as expected against actual.
 """
 
+import operator
+import reprlib
+
 import jax
 import numpy as np
+
+MAX_SLOTS = 2**31 - 2  # flat indices of the solvers are int32, and one is the padding's
 
 
 def as_host_array(name: str, value) -> np.ndarray:
@@ -17,13 +22,19 @@ def as_host_array(name: str, value) -> np.ndarray:
         )
     try:
         return np.asarray(value)
-    except ValueError as error:  # ragged nested lists
-        raise ValueError(f"{name} is not a rectangular array: {error}") from None
+    except (TypeError, ValueError) as error:  # ragged nested lists, keys and other objects
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{name} is not a rectangular array: {reason}") from None
 
 
 def is_traced(*trees) -> bool:
     """True if any leaf of the given pytrees is a traced value (host checks are then impossible)."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def in_one_line(value) -> str:
+    """`repr` for messages: without line breaks, and cut off where it is long."""
+    return " ".join(reprlib.repr(value).split())
 
 
 def require_shape(name: str, array, expected: str, condition: bool) -> None:
@@ -42,20 +53,29 @@ def require_all(name: str, array: np.ndarray, good: np.ndarray, message: str) ->
 
 
 def require_floats(name: str, array: np.ndarray) -> np.ndarray:
-    """Returns `array` as floating point (integers and booleans are converted); rejects NaN, infinity, text."""
-    if array.dtype.kind in "iub":
-        array = array.astype(np.float64)
-    if array.dtype.kind != "f":
+    """Returns `array` as floating point of at most 64 bits; rejects NaN, infinity, text."""
+    if array.dtype.kind not in "iubf":
         raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
+    if array.dtype.kind != "f" or array.dtype.itemsize > 8:
+        array = array.astype(np.float64)
     require_all(name, array, np.isfinite(array), "must be finite")
     return array
+
+
+def require_floats_in(dtype, name: str, array: np.ndarray) -> np.ndarray:
+    """Returns `array` as floats of the given type; rejects, beside NaN and so on, what overflows there."""
+    array = require_floats(name, array)
+    with np.errstate(over="ignore"):
+        converted = array.astype(dtype, copy=False)
+    require_all(name, array, np.isfinite(converted), f"is too large for {np.dtype(dtype)}")
+    return converted
 
 
 def require_integers(name: str, array: np.ndarray, upper: int | None = None) -> np.ndarray:
     """Returns `array` as int64 with every entry in [0, upper); floats that are whole numbers are accepted."""
     if array.dtype.kind == "f":
         require_all(name, array, np.isfinite(array) & (array == np.floor(array)), "must be whole")
-        require_all(name, array, np.abs(array) < 2**53, "is too large for an index")
+        require_all(name, array, np.abs(array.astype(np.float64)) < 2**53, "is too large for an index")
     elif array.dtype.kind not in "iu":
         raise ValueError(f"{name} must hold integers, got dtype {array.dtype}")
     require_all(name, array, array >= 0, "must not be negative")
@@ -68,19 +88,47 @@ def require_distribution(name: str, array: np.ndarray) -> np.ndarray:
     """Returns `array` as floats whose last axis is a probability distribution, to the dtype's rounding."""
     array = require_floats(name, array)
     require_all(name, array, array >= 0, "must not be negative")
-    total = array.sum(axis=-1, dtype=np.float64)
-    tolerance = 1e-6 if array.dtype == np.float64 else 1e-4
-    require_all(f"sum of {name}", total, np.abs(total - 1.0) <= tolerance, "must be 1")
+    with np.errstate(over="ignore"):
+        total = array.sum(axis=-1, dtype=np.float64)
+    require_all(f"sum of {name}", total, sums_to_one(total, array.dtype), "must be 1")
     return array
 
 
-def require_discount(discount) -> np.ndarray:
-    """Returns `discount` as a scalar strictly between 0 and 1."""
+def sums_to_one(total: np.ndarray, dtype) -> np.ndarray:
+    """Whether totals of rows of the given type are 1, to its rounding."""
+    return np.abs(total - 1.0) <= (1e-6 if dtype == np.float64 else 1e-4)
+
+
+def require_discount(discount, dtype=np.float64) -> np.ndarray:
+    """Returns `discount` as a scalar of the given type, strictly between 0 and 1 there too."""
     discount = require_floats("discount", as_host_array("discount", discount))
     require_shape("discount", discount, "()", discount.ndim == 0)
     if not 0.0 < discount < 1.0:
         raise ValueError(f"discount must lie strictly between 0 and 1, got {discount}")
-    return discount
+    rounded = discount.astype(dtype)
+    if not 0.0 < rounded < 1.0:
+        raise ValueError(f"discount must lie strictly between 0 and 1, got {discount}: that is {rounded} in {dtype}")
+    return rounded
+
+
+def require_count(name: str, value) -> int:
+    """Returns `value` as an int of at least 1."""
+    try:
+        value = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, got {in_one_line(value)}") from None
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value}")
+    return value
+
+
+def require_slots(num_states: int, num_actions: int, width: int) -> None:
+    """Raises if the successor slots of a model are too many for 32-bit indices; before they are allocated."""
+    if num_states * num_actions * width > MAX_SLOTS:
+        raise ValueError(
+            f"the model has {num_states} x {num_actions} x {width} successor slots (states, actions, widest row), "
+            f"more than 2^31 - 2"
+        )
 
 
 def require_model_pair(source, target) -> None:

@@ -36,14 +36,24 @@ class Demonstrations:
           trajectories: M pairs, each of two equally long, non-empty sequences; lengths may differ between pairs.
 
         Raises:
-          ValueError: if there is no trajectory, one is empty or not a pair, its lengths differ, or an entry is
-            negative or not whole; the trajectory and the step are named.
+          ValueError: if there is no trajectory, one is empty or not a pair, its lengths differ, an entry is negative
+            or not whole (the trajectory and the step are named), or all of them padded to the longest are too many
+            steps for 32-bit indices.
         """
-        trajectories = list(trajectories)
+        try:
+            trajectories = list(trajectories)
+        except TypeError:
+            kind = type(trajectories).__name__
+            raise ValueError(f"trajectories must be a sequence of pairs (states, actions), got {kind}") from None
         if not trajectories:
             raise ValueError("at least one trajectory is needed, got none")
         rows = [_validated_trajectory(i, pair) for i, pair in enumerate(trajectories)]
         horizon = max(len(states) for states, _ in rows)
+        if len(rows) * horizon > checks.MAX_SLOTS:
+            raise ValueError(
+                f"{len(rows)} trajectories padded to the longest, {horizon} steps, are more than 2^31 - 2 steps: "
+                "cut the long ones into pieces"
+            )
         states, actions = np.zeros((2, len(rows), horizon), np.int32)
         mask = np.zeros((len(rows), horizon), bool)
         for i, (row_states, row_actions) in enumerate(rows):
@@ -101,12 +111,13 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Arra
     """
     demonstrations.validate(mdp)
     shape = (mdp.num_states, mdp.num_actions)
-    weight = demonstrations.mask.astype(mdp.dtype)
-    counts = jnp.zeros(shape, mdp.dtype).at[demonstrations.states, demonstrations.actions].add(weight)
+    # Counted in integers and divided in JAX's default type: float32 would stop counting at 2^24, float16 at 2^11.
+    weight = demonstrations.mask.astype(jnp.int32)
+    counts = jnp.zeros(shape, jnp.int32).at[demonstrations.states, demonstrations.actions].add(weight).astype(float)
     visits = counts.sum(axis=-1, keepdims=True)
     visited = visits[:, 0] > 0
-    uniform = 1.0 / mdp.num_actions
-    return visited, jnp.where(visited[:, None], counts / jnp.maximum(visits, 1.0), uniform)
+    frequencies = (counts / jnp.maximum(visits, 1.0)).astype(mdp.dtype)
+    return visited, jnp.where(visited[:, None], frequencies, 1.0 / mdp.num_actions)
 
 
 def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> jax.Array:

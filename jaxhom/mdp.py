@@ -86,13 +86,14 @@ class MDP:
           The model, in the dtype of `transition` (integers become floats).
 
         Raises:
-          ValueError: on a wrong shape, or naming the first entry that is NaN, negative or out of range, or the
-            first row that does not sum to 1.
+          ValueError: on a wrong shape, on more than 2^31 - 2 entries, or naming the first entry that is NaN, negative
+            or out of range, or the first row that does not sum to 1.
         """
         transition = checks.as_host_array("transition", transition)
         shape = transition.shape
         good = len(shape) == 3 and shape[0] == shape[2] and min(shape, default=0) > 0
         checks.require_shape("transition", transition, "[S, A, S] with S, A >= 1", good)
+        checks.require_slots(*shape)
         transition = checks.require_distribution("transition", transition)
         num_states = shape[0]
         width = int((transition > 0).sum(axis=-1).max())
@@ -125,11 +126,13 @@ class MDP:
         checks.require_shape("next_state", next_state, "[S, A, N] with S, A, N >= 1", good)
         same = probability.shape == next_state.shape
         checks.require_shape("probability", probability, str(next_state.shape), same)
+        checks.require_slots(*next_state.shape)
         next_state = checks.require_integers("next_state", next_state, upper=len(next_state))
         probability = checks.require_distribution("probability", probability)
         next_state, probability = _merge_repeated(next_state, probability)
-        num_states, _, width = next_state.shape
+        num_states, num_actions, width = next_state.shape
         if width >= _DENSE_FRACTION * num_states:
+            checks.require_slots(num_states, num_actions, num_states)
             return cls.from_dense(
                 _scatter_dense(next_state, probability),
                 discount=discount,
@@ -147,12 +150,10 @@ class MDP:
         initial = checks.as_host_array("initial", initial)
         checks.require_shape("initial", initial, f"({num_states},)", initial.shape == (num_states,))
         initial = checks.require_distribution("initial", initial)
-        features = _validated_features(features, num_states, num_actions)
+        features = _validated_features(features, num_states, num_actions, dtype)
+        discount = checks.require_discount(discount, dtype)
+        _require_contraction(probability, discount)
         dense = width == num_states
-        if num_states * num_actions * width >= 2**31 - 1:
-            raise ValueError(
-                f"the model has {num_states} x {num_actions} x {width} successor slots, more than 2^31 - 2"
-            )
         narrow_width, wide_pairs, predecessors = width, np.zeros(0, np.int32), None
         if not dense:
             counts = (probability > 0).sum(axis=-1).ravel()
@@ -164,7 +165,7 @@ class MDP:
             probability=jnp.asarray(probability, dtype),
             initial=jnp.asarray(initial, dtype),
             features=jnp.asarray(features, dtype),
-            discount=jnp.asarray(checks.require_discount(discount), dtype),
+            discount=jnp.asarray(discount, dtype),
             wide_pairs=jnp.asarray(wide_pairs),
             predecessors=jax.tree.map(jnp.asarray, predecessors),
             narrow_width=narrow_width,
@@ -341,8 +342,15 @@ def _scatter_dense(next_state, probability) -> np.ndarray:
     return transition
 
 
-def _validated_features(features, num_states: int, num_actions: int) -> np.ndarray:
-    """Returns features as [S, A, K], or raises."""
+def _require_contraction(probability: np.ndarray, discount: np.ndarray) -> None:
+    """Raises where a sum within the tolerance of 1 makes discounted sums diverge all the same."""
+    total = probability.sum(axis=-1, dtype=np.float64)
+    message = f"is too far above 1 for a discount of {discount}"
+    checks.require_all("sum of probability", total, total * np.float64(discount) < 1.0, message)
+
+
+def _validated_features(features, num_states: int, num_actions: int, dtype) -> np.ndarray:
+    """Returns features as [S, A, K] in the model's type, or raises."""
     if features is None:
         return np.zeros((num_states, num_actions, 0))
     features = checks.as_host_array("features", features)
@@ -350,7 +358,7 @@ def _validated_features(features, num_states: int, num_actions: int) -> np.ndarr
     by_pair = features.ndim == 3 and features.shape[:2] == (num_states, num_actions)
     expected = f"({num_states}, {num_actions}, K) or ({num_states}, K)"
     checks.require_shape("features", features, expected, by_state or by_pair)
-    features = checks.require_floats("features", features)
+    features = checks.require_floats_in(dtype, "features", features)
     if by_pair:
         return features
     return np.broadcast_to(features[:, None], (num_states, num_actions, features.shape[-1]))

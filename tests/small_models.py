@@ -38,6 +38,14 @@ def random_policy(rng, *shape):
     return rng.dirichlet(np.ones(shape[-1]), size=shape[:-1])
 
 
+def dense_transition(mdp):
+    """T [S, A, S] of a model in NumPy: without compiling anything for its shape."""
+    transition = np.zeros((mdp.num_states, mdp.num_actions, mdp.num_states))
+    s, a, _ = np.indices(mdp.probability.shape)
+    np.add.at(transition, (s, a, np.asarray(mdp.next_state)), np.asarray(mdp.probability))
+    return transition
+
+
 @functools.cache
 def case(name: str) -> Case:
     transition, discount, initial, features = _BUILDERS[name]()

@@ -130,8 +130,8 @@ print(json.dumps([changed, jax.config.jax_enable_x64, sorted(sys.modules)]))
 
 @pytest.mark.parametrize("x64", ["0", "1"])
 def test_importing_changes_no_setting_and_brings_in_no_optional_library(x64):
-    """`import jaxhom`, and its modules up to the domains, in a fresh interpreter."""
-    core = [m for m in FILES if ROWS.get(row_name(m), 9) <= LAST_CORE_ROW]
+    """`import jaxhom`, its modules up to the domains, and the doors to other libraries, in a fresh interpreter."""
+    core = [m for m in FILES if ROWS.get(row_name(m), 9) <= LAST_CORE_ROW or row_name(m) == "interop"]
     result = subprocess.run(
         [sys.executable, "-c", PROBE.format(modules=core)],
         cwd=ROOT,

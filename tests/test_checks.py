@@ -7,7 +7,9 @@ import pytest
 from jaxhom import checks
 
 
-@pytest.mark.parametrize("value", [[0, 2], np.array([0.0, 2.0]), np.array([0, 2], np.uint8)])
+@pytest.mark.parametrize(
+    "value", [[0, 2], np.array([0.0, 2.0]), np.array([0, 2], np.uint8), np.array([0, 2], np.float16)]
+)
 def test_whole_numbers_of_any_type_are_integers(value):
     result = checks.require_integers("states", np.asarray(value), upper=3)
     assert result.dtype == np.int64
@@ -41,6 +43,12 @@ def test_float32_keeps_its_type_and_has_its_own_tolerance():
     assert checks.require_distribution("row", row).dtype == np.float32
     with pytest.raises(ValueError, match=r"sum of row must be 1, got 1\.00001"):
         checks.require_distribution("row", row.astype(np.float64))
+
+
+@pytest.mark.parametrize("value", [np.eye(3), "x" * 1000, ["a\nb"] * 50, object()])
+def test_values_in_messages_are_short_and_have_no_line_breaks(value):
+    text = checks.in_one_line(value)
+    assert 0 < len(text) < 200 and "\n" not in text
 
 
 def test_is_traced_sees_one_traced_leaf():

@@ -73,10 +73,18 @@ def test_any_whole_numbers_in_any_sequence_will_do(trajectories):
         ([([0, np.nan], [0, 1])], "trajectory 0 states[1] must be whole, got nan"),
         ([([0, 2**31], [0, 1])], "trajectory 0 states[1] must be below 2147483647, got 2147483648"),
         ([(["left"], [0])], "trajectory 0 states must hold integers, got dtype <U4"),
+        (None, "trajectories must be a sequence of pairs (states, actions), got NoneType"),
     ],
 )
 def test_from_trajectories_refuses(trajectories, message):
     with pytest.raises(ValueError, match=re.escape(message)):
+        Demonstrations.from_trajectories(trajectories)
+
+
+def test_one_long_trajectory_among_many_is_refused_before_it_is_padded():
+    steps = np.zeros(100_000, np.int8)
+    trajectories = [(steps, steps)] + [(steps[:1], steps[:1])] * 21_475
+    with pytest.raises(ValueError, match=r"21476 trajectories padded to the longest, 100000 steps, .* 2\^31 - 2"):
         Demonstrations.from_trajectories(trajectories)
 
 
@@ -194,6 +202,15 @@ def test_float32_models_give_float32():
     assert policy.dtype == expectations.dtype == jnp.float32
     expected = oracles.monte_carlo_feature_expectations(case.features, case.discount, RAGGED)
     np.testing.assert_allclose(expectations, expected, rtol=1e-6)
+
+
+def test_frequencies_do_not_stop_counting():
+    """float16 counts in ones up to 2048, as float32 does up to 2^24."""
+    mdp = MDP.from_dense(np.ones((1, 2, 1), np.float16), discount=0.5)
+    actions = np.arange(100_000) % 4 == 0
+    _, policy = POLICY(mdp, Demonstrations.from_trajectories([(np.zeros(100_000, int), actions.astype(int))]))
+    assert policy.dtype == jnp.float16
+    np.testing.assert_array_equal(policy, [[0.75, 0.25]])
 
 
 # ---------------------------------------------------------------------------------------- sampling

@@ -10,6 +10,7 @@ import oracles
 import pytest
 import small_models
 
+from jaxhom import checks
 from jaxhom.mdp import MDP, expected_next_value, push_forward, state_transition
 
 
@@ -107,6 +108,7 @@ def test_initial_is_uniform_and_features_are_empty_by_default():
         (np.ones((1, 1, 1), int), jnp.float64),
         (np.ones((1, 1, 1), np.float32), jnp.float32),
         ([[[1.0]]], jnp.float64),
+        (np.ones((1, 1, 1), np.longdouble), jnp.float64),
         (jnp.ones((1, 1, 1), jnp.float32), jnp.float32),
     ],
 )
@@ -240,6 +242,9 @@ HALF = np.full((2, 2, 2), 0.5)
         (changed(HALF, (0, 1, 1), 0.4), "sum of transition[0, 1] must be 1, got 0.9"),
         (HALF.astype(str), "transition must hold real numbers, got dtype <U"),
         (HALF.astype(complex), "transition must hold real numbers, got dtype complex128"),
+        (HALF * 1e308, "sum of transition[0, 0] must be 1, got "),
+        (jax.random.key(0), "transition is not a rectangular array"),
+        (np.broadcast_to(1e-5, (40_000, 2, 40_000)), "40000 x 2 x 40000 successor slots"),
     ],
 )
 def test_from_dense_refuses_transition(transition, message):
@@ -265,6 +270,21 @@ def test_constructors_refuse_discount(discount, message):
 
 
 @pytest.mark.parametrize(
+    ("discount", "message"),
+    [
+        (1.0 - 1e-9, "got 0.999999999: that is 1.0 in float32"),
+        (1e-60, "got 1e-60: that is 0.0 in float32"),
+        (0.99995, "sum of probability[1, 0] is too far above 1 for a discount of 0.99"),
+    ],
+)
+def test_discounts_that_rounding_makes_useless_are_refused(discount, message):
+    transition = changed(HALF, (1, 0, 1), 0.50009).astype(np.float32)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        MDP.from_dense(transition, discount=discount)
+    assert float(MDP.from_dense(HALF, discount=0.99995).discount) == 0.99995
+
+
+@pytest.mark.parametrize(
     ("initial", "message"),
     [
         ([1.0], "initial must have shape (2,), got (1,)"),
@@ -287,11 +307,12 @@ def test_constructors_refuse_initial(initial, message):
         (np.zeros((2, 3, 4)), "features must have shape (2, 2, K) or (2, K), got (2, 3, 4)"),
         (changed(np.zeros((2, 2, 3)), (0, 1, 2), np.nan), "features[0, 1, 2] must be finite"),
         (changed(np.zeros((2, 3)), (1, 2), np.inf), "features[1, 2] must be finite, got inf"),
+        (changed(np.zeros((2, 3)), (1, 2), 1e60), "features[1, 2] is too large for float32, got 1e+60"),
     ],
 )
 def test_constructors_refuse_features(features, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        MDP.from_dense(HALF, discount=0.9, features=features)
+        MDP.from_dense(HALF.astype(np.float32), discount=0.9, features=features)
 
 
 STATES = np.zeros((2, 1, 2), int)
@@ -318,11 +339,24 @@ CHANCES = np.full((2, 1, 2), 0.5)
             "probability[1, 0, 1] must not be negative",
         ),
         (STATES, changed(CHANCES, (1, 0, 0), 0.6), "sum of probability[1, 0] must be 1, got 1.1"),
+        (
+            np.broadcast_to(0, (50_000, 5, 9_000)),
+            np.broadcast_to(1 / 9_000, (50_000, 5, 9_000)),
+            "50000 x 5 x 9000 successor slots",
+        ),
     ],
 )
 def test_from_successors_refuses(next_state, probability, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         MDP.from_successors(next_state, probability, discount=0.9)
+
+
+def test_a_dense_layout_with_too_many_entries_is_refused_before_it_is_made(monkeypatch):
+    """One row with a quarter of the states asks for the dense layout; the limit is lowered, for want of memory."""
+    monkeypatch.setattr(checks, "MAX_SLOTS", 1000)
+    next_state = np.tile(np.arange(10), (40, 1, 1))
+    with pytest.raises(ValueError, match="40 x 1 x 40 successor slots"):
+        MDP.from_successors(next_state, np.full(next_state.shape, 0.1), discount=0.9)
 
 
 @pytest.mark.parametrize("argument", ["transition", "discount", "initial", "features"])

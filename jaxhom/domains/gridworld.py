@@ -12,12 +12,12 @@ uniform on (0, 1) otherwise (`sample_weights`).
 import dataclasses
 import functools
 import math
-import operator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.mdp import MDP
 
 ACTIONS = ("up", "down", "left", "right")
@@ -78,7 +78,7 @@ def gridworld(
       >>> world.mdp.num_states, world.mdp.num_features
       (256, 64)
     """
-    size = _require_size(size)
+    size = checks.require_count("size", size)
     if not 0.0 <= noise <= 1.0:
         raise ValueError(f"noise must lie in [0, 1], got {noise}")
     row, column = start
@@ -153,17 +153,6 @@ def _transition(coordinates, size: int, noise: float) -> tuple[np.ndarray, np.nd
     next_state = np.concatenate([landing[..., None], at_random], axis=-1)
     probability = np.array([1.0 - noise] + [noise / 4] * 4)
     return next_state, np.broadcast_to(probability, next_state.shape)
-
-
-def _require_size(size) -> int:
-    """Returns `size` as an int of at least 1, or raises."""
-    try:
-        size = operator.index(size)
-    except TypeError:
-        raise ValueError(f"size must be a whole number, got {size!r}") from None
-    if size < 1:
-        raise ValueError(f"size must be at least 1, got {size}")
-    return size
 
 
 def _region_side(size: int, num_regions: int) -> int:

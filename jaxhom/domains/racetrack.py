@@ -31,14 +31,14 @@ States are numbered cell by cell: state = 25 * cell + speed.
 
 import dataclasses
 import os
-import pathlib
 from collections.abc import Iterable, Sequence
-from importlib import resources
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom import checks
+from jaxhom.domains.track_maps import read_map
 from jaxhom.mdp import MDP
 
 ACTIONS = ("nothing", "up", "down", "left", "right")
@@ -50,7 +50,6 @@ _SPEEDS = np.stack(np.divmod(np.arange(25), 5), axis=-1) - 2
 _STANDING = 12  # index of speed (0, 0)
 _SUCCESS = (0.9, 0.5)  # of a change of speed: low or zero speed, high speed
 _WEIGHTS = (5.0, 200.0)
-_LETTERS = {"X": "#", "x": "#", "#": "#", " ": ".", ".": ".", "S": "S", "G": "F", "F": "F"}
 _ON_ROAD, _FINISH, _OFF_ROAD = range(3)
 
 
@@ -106,8 +105,10 @@ def racetrack(
 ) -> Racetrack:
     """Builds the racetrack of section VI.B.
 
-    A map has one letter per cell: `X`, `x` or `#` wall, space or `.` road, `S` road on the start
-    line, `F` or `G` finish line. Short rows are filled up with wall, and beyond the map is wall.
+    A map has one letter per cell: `X`, `x` or `#` wall, space or `.` road, `S` or `s` road on the
+    start line, `F`, `G` or `g` finish line; beyond the map is wall. A header with the map's size,
+    as `.track` files of planning benchmarks have it, is understood (see `track_maps`); without one,
+    short rows are filled up with wall.
 
     Args:
       track: "a" (236 cells) or "b" (204 cells, drawn for this library: the paper's map is not
@@ -123,9 +124,9 @@ def racetrack(
       The racetrack.
 
     Raises:
-      ValueError: on an unknown letter (naming its line and column, counted from 1), on a map
-        without road or without finish line, and on a start cell that is missing from the road or
-        repeated.
+      ValueError: on an unknown letter (naming its line and column, counted from 1), on a header that
+        is malformed or disagrees with the map, on a map without road or without finish line, and on
+        a start cell that is missing from the road or repeated.
       FileNotFoundError: if `track` is text without line breaks, and neither a shipped track nor a
         file.
 
@@ -136,11 +137,12 @@ def racetrack(
     """
     if start is None and isinstance(track, str):
         start = SHIPPED_STARTS.get(track)
-    rows = _parse(_read_lines(track))
+    rows = read_map(track)
     grid = np.array([list(row) for row in rows])
     cells = np.argwhere(grid != "#")
     terminal = np.repeat(grid[tuple(cells.T)] == "F", 25)
     restart = np.array(_start_cells(rows, grid, start)) * 25 + _STANDING
+    checks.require_slots(len(terminal), len(ACTIONS), max(2, len(restart)))
     next_state, probability, events = _transition(grid, cells)  # [S, A, 2], [S, A, 2], [S, A, 3]
     events[terminal] = 0.0
     next_state, probability = _with_restart(next_state, probability, terminal, restart)
@@ -245,40 +247,3 @@ def _cell_index(rows: tuple[str, ...], cell: Sequence[int], name: str) -> int:
         raise ValueError(f"{name} {tuple(cell)} is {where}")
     before = "".join(rows[:row]) + rows[row][:column]
     return len(before) - before.count("#")
-
-
-def _read_lines(track) -> list[str]:
-    """The lines of a shipped track, a file, a text or a sequence of lines."""
-    if not isinstance(track, str | os.PathLike):
-        return list(track)
-    if isinstance(track, str) and ("\n" in track or "\r" in track):
-        return track.splitlines()
-    if isinstance(track, str) and track in SHIPPED_STARTS:
-        folder = resources.files("jaxhom.domains") / "tracks"
-        return (folder / f"{track}.track").read_text(encoding="utf-8").splitlines()
-    path = pathlib.Path(track)
-    if not path.is_file():
-        shipped = ", ".join(SHIPPED_STARTS)
-        raise FileNotFoundError(f"track {str(track)!r} is neither shipped ({shipped}) nor a file")
-    return path.read_text(encoding="utf-8").splitlines()
-
-
-def _parse(lines: Iterable[str]) -> tuple[str, ...]:
-    """Checks a map and returns it in the letters `#.SF`, all rows of the same length."""
-    rows = []
-    for line, text in enumerate(lines, start=1):
-        text = text.rstrip("\r\n")
-        for column, letter in enumerate(text, start=1):
-            if letter not in _LETTERS:
-                raise ValueError(
-                    f"track line {line}, column {column}: unknown letter {letter!r}; "
-                    "use X, x or # (wall), space or . (road), S (start), F or G (finish)"
-                )
-        rows.append("".join(_LETTERS[letter] for letter in text))
-    width = max(map(len, rows), default=0)
-    rows = tuple(row.ljust(width, "#") for row in rows)
-    if not any(letter in row for row in rows for letter in ".S"):
-        raise ValueError(f"track has no road cell (space, . or S) in its {len(rows)} lines")
-    if not any("F" in row for row in rows):
-        raise ValueError(f"track has no finish cell (F or G) in its {len(rows)} lines")
-    return rows

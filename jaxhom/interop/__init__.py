@@ -1,5 +1,17 @@
-"""Ways in and out: files of models, demonstrations and policies."""
+"""Ways in and out of the library: environments, models, data of others, and files.
 
+* `from_gymnasium`: an environment with a transition table, with its reward.
+* `from_mdptoolbox`, `from_scipy`: transition matrices.
+* `from_samples`: recorded transitions, with the uncertainty of each row.
+* `demonstrations_from_episodes`, `demonstrations_from_steps`, `demonstrations_from_csv`: trajectories of `imitation`,
+  Minari, arrays and CSV files, with a report of what was dropped.
+* `save_*`, `load_*`: models, demonstrations and policies in `.npz` files.
+
+Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` itself. No other library is imported
+before it is needed.
+"""
+
+from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
 from jaxhom.interop.files import (
     FileError,
     load_demonstrations,
@@ -9,9 +21,27 @@ from jaxhom.interop.files import (
     save_mdp,
     save_policy,
 )
+from jaxhom.interop.matrices import from_mdptoolbox, from_scipy
+from jaxhom.interop.samples import SampledModel, from_samples
+from jaxhom.interop.trajectories import (
+    ImportReport,
+    demonstrations_from_csv,
+    demonstrations_from_episodes,
+    demonstrations_from_steps,
+)
 
 __all__ = [
     "FileError",
+    "GymnasiumModel",
+    "ImportReport",
+    "SampledModel",
+    "demonstrations_from_csv",
+    "demonstrations_from_episodes",
+    "demonstrations_from_steps",
+    "from_gymnasium",
+    "from_mdptoolbox",
+    "from_samples",
+    "from_scipy",
     "load_demonstrations",
     "load_mdp",
     "load_policy",

@@ -10,13 +10,14 @@
                     length            integers [M], optional: steps of each trajectory; H if missing
     policy          policy            [S, A], rows sum to 1
                     and whatever else its maker put there
+    each            format_version    1, optional
 
 Anything that `numpy.savez` wrote with these names is read. What is read goes through the same checks as fresh input;
-whatever is wrong is one `FileError` that names the file and the array.
+whatever is wrong is one `FileError` that names the file and the array. A file of a newer format is refused.
 """
 
+import contextlib
 import os
-import zipfile
 from collections.abc import Mapping
 
 import numpy as np
@@ -85,39 +86,74 @@ def load_policy(path: str | os.PathLike) -> np.ndarray:
     arrays = _read(path)
     _require(path, arrays, "policy")
     try:
-        policy = arrays["policy"]
-        checks.require_shape("policy", policy, "[S, A]", policy.ndim == 2)
-        return checks.require_distribution("policy", policy)
+        return _validated_policy(arrays["policy"])
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
 
 
 def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
-    """Writes a model, in the successor layout."""
-    names = ("next_state", "probability", "initial", "features", "discount")
-    _write(path, {name: getattr(mdp, name) for name in names})
+    """Writes a model, in the layout it has; `load_mdp` gives it back bit by bit.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    layout = {"transition": mdp.probability} if mdp.is_dense else _fields(mdp, "next_state", "probability")
+    _write(path, {**layout, **_fields(mdp, "initial", "features", "discount")})
 
 
 def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations) -> None:
-    """Writes demonstrations."""
-    length = np.asarray(demonstrations.mask).sum(axis=1)
-    arrays = {"states": demonstrations.states, "actions": demonstrations.actions, "length": length}
-    _write(path, arrays)
+    """Writes demonstrations.
+
+    Raises:
+      ValueError: if `mask` is not a prefix of every row, or leaves one empty.
+      OSError: as `save_mdp`.
+    """
+    mask = np.asarray(demonstrations.mask)
+    length = mask.sum(axis=1)
+    prefix = np.arange(mask.shape[1]) < np.maximum(length, 1)[:, None]
+    checks.require_all(
+        "mask", mask, mask == prefix, "must be True on the first steps of each trajectory and only there"
+    )
+    _write(path, {**_fields(demonstrations, "states", "actions"), "length": length})
 
 
 def save_policy(path: str | os.PathLike, policy, **extras) -> None:
-    """Writes a policy [S, A] and any further arrays by name."""
-    _write(path, {"policy": policy, **extras})
+    """Writes a policy [S, A] and any further arrays by name.
+
+    Raises:
+      ValueError: if `policy` is none, or an extra has a reserved name or is no plain array.
+      OSError: as `save_mdp`.
+    """
+    policy = _validated_policy(checks.as_host_array("policy", policy))
+    arrays = {name: checks.as_host_array(name, array) for name, array in extras.items()}
+    for name, array in arrays.items():
+        if name in ("file", "format_version", "allow_pickle"):
+            raise ValueError(f"an array of a policy's file cannot be called {name!r}")
+        if array.dtype.hasobject:
+            raise ValueError(f"{name} must be a plain array, got dtype {array.dtype}")
+    _write(path, {"policy": policy, **arrays})
 
 
-def _write(path: str | os.PathLike, arrays: Mapping[str, object]) -> None:
+def _validated_policy(policy: np.ndarray) -> np.ndarray:
+    checks.require_shape("policy", policy, "[S, A] with S, A >= 1", policy.ndim == 2 and policy.size > 0)
+    return checks.require_distribution("policy", policy)
+
+
+def _fields(value, *names: str) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(value, name)) for name in names}
+
+
+def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
     """Writes to a file beside `path` first, so that an interrupted write leaves no half of a file there."""
-    path = os.fspath(path)
-    partial = f"{path}.partial"
-    with open(partial, "wb") as file:
-        arrays = {name: np.asarray(array) for name, array in arrays.items()}
-        np.savez_compressed(file, format_version=FORMAT_VERSION, **arrays)
-    os.replace(partial, path)
+    partial = f"{os.fspath(path)}.partial"
+    try:
+        with open(partial, "wb") as file:
+            np.savez_compressed(file, format_version=FORMAT_VERSION, **arrays)
+        os.replace(partial, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.remove(partial)
+        raise
 
 
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
@@ -132,13 +168,21 @@ def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
         raise FileError(f"{path}: no such file") from None
     except FileError:
         raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except Exception as error:  # of damaged headers NumPy and the standard library raise what they come upon
+        reason = str(error).partition("\n")[0] or type(error).__name__
         raise FileError(f"{path}: not a readable .npz archive ({reason})") from None
-    version = arrays.pop("format_version", np.asarray(FORMAT_VERSION))
-    if version.shape != () or int(version) > FORMAT_VERSION:
-        raise FileError(f"{path}: written in format {version}, this release reads up to {FORMAT_VERSION}")
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray):
+            raise FileError(f"{path}: {name!r} is not a NumPy array")
+    _require_version(path, arrays.pop("format_version", np.asarray(FORMAT_VERSION)))
     return arrays
+
+
+def _require_version(path: str | os.PathLike, version: np.ndarray) -> None:
+    if version.shape != () or version.dtype.kind not in "iu" or version < 1:
+        raise FileError(f"{path}: format_version must be a whole number from 1 on, got {version.tolist()}")
+    if version > FORMAT_VERSION:
+        raise FileError(f"{path}: written in format {version}, this release reads up to {FORMAT_VERSION}")
 
 
 def _require(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:

@@ -1,0 +1,216 @@
+"""Gymnasium environments with a transition table `P`, as models.
+
+`env.unwrapped.P[s][a]` lists outcomes (probability p, next state z, reward r, terminated t): FrozenLake, Taxi,
+CliffWalking and whatever was written after them. Outcomes with one next state are added up, and
+
+    r(s, a) = sum over outcomes of p r        an expected reward per pair, which is all that values depend on.
+
+*Termination.* A table goes on after the end of an episode: the goal has rows of its own that lead on. Here a state
+that some outcome enters with `terminated` ends every episode: it becomes absorbing, with reward 0. That leaves all
+values from the initial states unchanged if such a state is never entered without `terminated` in the course of an
+episode. A table where it is (a move that succeeds, or succeeds and ends the episode by chance) is refused: for it
+there is `end_state=True`, where every terminated outcome leads to one further, absorbing state, number S, and the
+states of the environment stay as they are. That is right for every table.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from jaxhom import checks
+from jaxhom.mdp import MDP
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class GymnasiumModel:
+    """The model of an environment, and the reward that its authors gave it. See `from_gymnasium`.
+
+    Attributes:
+      mdp: the model; states and actions are numbered as in the environment.
+      reward: float [S, A], expected reward of a step; 0 on absorbing states. For evaluation, or `optimal_policy`.
+      terminal: bool [S], the states made absorbing, in which episodes have ended.
+    """
+
+    mdp: MDP
+    reward: jax.Array
+    terminal: jax.Array
+
+
+def from_gymnasium(env, *, discount, features=None, initial=None, end_state: bool = False) -> GymnasiumModel:
+    """Builds the model of a Gymnasium environment from its table `env.unwrapped.P`.
+
+    Args:
+      env: an environment, wrapped or not, or the id of one to make (`"FrozenLake-v1"`), which is closed again.
+      discount: scalar, strictly between 0 and 1; environments have none.
+      features: [S, A, K] or [S, K], by the environment's states; no features (K = 0) if None.
+      initial: [S] distribution of the first state; the environment's `initial_state_distrib` if None.
+      end_state: False: states that end episodes become absorbing (see the module's text). True: one absorbing state
+        is added as the last, with features and reward 0, and every terminated outcome leads there.
+
+    Returns:
+      The model, with its reward and its terminal states.
+
+    Raises:
+      ValueError: if there is no such environment; if it has no table `P` or no initial distribution; naming the first
+        entry of the table that is malformed; naming a state in which some episodes end and others go on, unless
+        `end_state`; and as `MDP.from_successors`.
+      ImportError: for an id, if Gymnasium is not installed.
+
+    Example:
+      >>> lake = from_gymnasium("FrozenLake-v1", discount=0.99)
+      >>> lake.mdp.num_states, lake.mdp.num_actions, int(lake.terminal.sum())
+      (16, 4, 5)
+    """
+    if isinstance(env, str):
+        env = _make(env)
+        try:
+            return from_gymnasium(env, discount=discount, features=features, initial=initial, end_state=end_state)
+        finally:
+            env.close()
+    next_state, probability, outcome_reward, terminated = _table(env)
+    initial = _initial(env, initial, len(next_state))
+    reward = np.sum(probability * outcome_reward, axis=-1)
+    if end_state:
+        next_state = np.where(terminated, len(next_state), next_state)
+        next_state, probability, reward = (_with_row(array) for array in (next_state, probability, reward))
+        terminal = np.arange(len(next_state)) == len(next_state) - 1
+        initial = np.append(initial, 0.0)
+        features = None if features is None else _with_row(_state_features(features, len(initial) - 1))
+    else:
+        terminal = np.zeros(len(next_state), bool)
+        terminal[next_state[terminated]] = True
+        _require_ends(next_state, probability, terminated, terminal, initial)
+    reward[terminal] = 0.0
+    next_state[terminal] = np.flatnonzero(terminal)[:, None, None]
+    probability[terminal] = np.arange(probability.shape[-1]) == 0
+    mdp = MDP.from_successors(next_state, probability, discount=discount, initial=initial, features=features)
+    reward = jnp.asarray(checks.require_floats_in(mdp.dtype, "expected reward", reward))
+    return GymnasiumModel(mdp=mdp, reward=reward, terminal=jnp.asarray(terminal))
+
+
+def _make(name: str):
+    """The environment of that id."""
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise ImportError(
+            f"making {name!r} needs gymnasium, which is not installed: pip install 'jaxhom[interop]'"
+        ) from error
+    try:
+        return gymnasium.make(name)
+    except gymnasium.error.Error as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"environment {name!r} cannot be made: {reason}") from None
+
+
+def _table(env) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Next states, probabilities, rewards and terminations, each [S, A, N], padded with probability 0."""
+    table = getattr(getattr(env, "unwrapped", env), "P", None)
+    if table is None:
+        raise ValueError(
+            f"{_name(env)} has no transition table P: record transitions in it, and estimate a model with "
+            "jaxhom.interop.from_samples"
+        )
+    entries = _entries(_rows(table, _name(env)))
+    probability, next_state, reward, terminated = np.moveaxis(entries, -1, 0)
+    probability = checks.require_distribution("P: probability", probability)
+    next_state = checks.require_integers("P: next state", next_state, upper=len(entries))
+    reward = checks.require_floats("P: reward", reward)
+    return next_state, probability.copy(), reward, (terminated != 0) & (probability > 0)
+
+
+def _entries(rows: list[list]) -> np.ndarray:
+    """The table's numbers, [S, A, N, 4], padded with zeros."""
+    width = max(1, max(len(outcomes) for row in rows for outcomes in row))
+    checks.require_slots(len(rows), len(rows[0]), width)
+    entries = np.zeros((len(rows), len(rows[0]), width, 4))
+    for s, row in enumerate(rows):
+        for a, outcomes in enumerate(row):
+            for i, outcome in enumerate(outcomes):
+                try:
+                    probability, next_state, reward, terminated = outcome
+                    entries[s, a, i] = probability, next_state, reward, terminated
+                except (TypeError, ValueError):
+                    expected = "(probability, next state, reward, terminated)"
+                    got = checks.in_one_line(outcome)
+                    raise ValueError(f"P[{s}][{a}][{i}] must be {expected}, got {got}") from None
+    return entries
+
+
+def _rows(table, name: str) -> list[list]:
+    """The table as nested lists, whatever it is kept in: states 0 ... S-1, each with actions 0 ... A-1."""
+    try:
+        num_states = len(table)
+        num_actions = len(table[0]) if num_states else 0
+        rows = [[list(table[s][a]) for a in range(len(table[s]))] for s in range(num_states)]
+    except (TypeError, KeyError, IndexError) as error:
+        raise ValueError(
+            f"P of {name} must hold a list of outcomes as P[state][action], both numbered from 0: "
+            f"{type(error).__name__} {error}"
+        ) from None
+    if not num_states or not num_actions:
+        raise ValueError(f"P of {name} must have at least one state and one action")
+    for s, row in enumerate(rows):
+        if len(row) != num_actions:
+            raise ValueError(f"P[{s}] has {len(row)} actions, but P[0] has {num_actions}: all states need the same")
+    return rows
+
+
+def _name(env) -> str:
+    return f"environment {type(getattr(env, 'unwrapped', env)).__name__}"
+
+
+def _initial(env, initial, num_states: int) -> np.ndarray:
+    """The given distribution of the first state, or the environment's own."""
+    if initial is None:
+        initial = getattr(getattr(env, "unwrapped", env), "initial_state_distrib", None)
+    if initial is None:
+        raise ValueError(
+            f"{_name(env)} has no initial_state_distrib: pass initial, the distribution of the first state"
+        )
+    initial = checks.as_host_array("initial", initial)
+    checks.require_shape("initial", initial, f"({num_states},)", initial.shape == (num_states,))
+    return checks.require_distribution("initial", initial)
+
+
+def _state_features(features, num_states: int) -> np.ndarray:
+    """Features with one row per state of the environment."""
+    features = checks.as_host_array("features", features)
+    good = features.ndim in (2, 3) and len(features) == num_states
+    checks.require_shape("features", features, f"({num_states}, A, K) or ({num_states}, K)", good)
+    return features
+
+
+def _with_row(array: np.ndarray) -> np.ndarray:
+    """`array` with a row of zeros appended, for a state that was added."""
+    return np.pad(array, [(0, 1)] + [(0, 0)] * (array.ndim - 1))
+
+
+def _require_ends(next_state, probability, terminated, terminal, initial) -> None:
+    """Raises if an episode can start in a terminal state or enter one without ending."""
+    num_states = len(next_state)
+    source, action, slot = np.nonzero((probability > 0) & ~terminated)
+    target = next_state[source, action, slot]
+    starts = np.flatnonzero(initial)
+    # One more node, with arrows to the initial states, is where the search starts.
+    arrows = (np.append(source, np.full(len(starts), num_states)), np.append(target, starts))
+    graph = scipy.sparse.csr_array((np.ones(len(arrows[0])), arrows), shape=(num_states + 1, num_states + 1))
+    order = scipy.sparse.csgraph.breadth_first_order(graph, num_states, return_predecessors=False)
+    alive = np.zeros(num_states + 1, bool)
+    alive[order] = True
+    mixed = terminal & alive[:-1]
+    if not np.any(mixed):
+        return
+    state = int(np.flatnonzero(mixed)[0])
+    how = "episodes start in it"
+    if not initial[state] > 0:
+        entry = np.flatnonzero((target == state) & alive[source])[0]
+        how = f"state {source[entry]} enters it by action {action[entry]} without terminating"
+    raise ValueError(
+        f"state {state} ends some episodes, but {how}: it cannot be made absorbing; pass end_state=True, "
+        "which sends every terminated outcome to one state more"
+    )

@@ -1,0 +1,135 @@
+"""Models from matrices: the layout of the MDP toolboxes, and SciPy's sparse matrices.
+
+MDP toolboxes (Python, R, MATLAB) keep transitions action first, one S x S matrix per action. Sparse matrices are never
+made dense: their rows become lists of successors, padded to the longest. A model whose rows are all short is small; one
+row with successors everywhere makes all of them long.
+
+Rewards of a toolbox: [S] and [S, A] are what `optimal_policy` and `policy_value` take; [A, S, S], a reward per
+transition, becomes [S, A] by `numpy.einsum("asz,asz->sa", transitions, reward)`.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.sparse
+
+from jaxhom import checks
+from jaxhom.mdp import MDP
+
+
+def from_mdptoolbox(transitions, *, discount, initial=None, features=None) -> MDP:
+    """Builds a model from transitions in the layout of the MDP toolboxes.
+
+    Args:
+      transitions: [A, S, S], transitions[a, s, z] = T(s, a, z); or a sequence (list, tuple, object array) of A
+        matrices [S, S], SciPy sparse ones or arrays.
+      discount: scalar, strictly between 0 and 1.
+      initial: [S] distribution of the first state; uniform if None.
+      features: [S, A, K] or [S, K]; no features (K = 0) if None.
+
+    Returns:
+      The model, in the dtype of `transitions`.
+
+    Raises:
+      ValueError: on a wrong shape, naming action, state and next state of the first entry that is not finite or
+        negative, or action and state of the first row that does not sum to 1; and as `MDP.from_successors`.
+    """
+    if scipy.sparse.issparse(transitions):
+        raise ValueError(
+            "transitions must be [A, S, S] or a sequence of A matrices; one sparse matrix is for from_scipy"
+        )
+    is_object_array = isinstance(transitions, np.ndarray) and transitions.dtype.hasobject and transitions.ndim == 1
+    is_sequence = isinstance(transitions, list | tuple) or is_object_array
+    if is_sequence and any(scipy.sparse.issparse(matrix) for matrix in transitions):
+        return _from_sparse(list(transitions), discount, initial, features)
+    if is_sequence:
+        transitions = list(transitions)
+    transitions = checks.as_host_array("transitions", transitions)
+    good = transitions.ndim == 3 and transitions.shape[1] == transitions.shape[2] and min(transitions.shape) > 0
+    checks.require_shape("transitions", transitions, "[A, S, S] with A, S >= 1", good)
+    transitions = checks.require_distribution("transitions", transitions)
+    return MDP.from_dense(np.moveaxis(transitions, 0, 1), discount=discount, initial=initial, features=features)
+
+
+def _from_sparse(matrices: list, discount, initial, features) -> MDP:
+    num_states, num_actions = max(np.shape(matrices[0]), default=0), len(matrices)
+    for a, matrix in enumerate(matrices):
+        expected = f"({num_states}, {num_states}) with at least one state"
+        good = np.shape(matrix) == (num_states, num_states) and num_states > 0
+        checks.require_shape(f"transitions[{a}]", matrix, expected, good)
+    stacked = scipy.sparse.vstack([scipy.sparse.csr_array(matrix) for matrix in matrices], format="csr")
+    rows = _checked_rows(stacked, lambda row: f"transitions[{row // num_states}] row {row % num_states}")
+    order = np.arange(num_actions * num_states).reshape(num_actions, num_states).T.ravel()
+    return _from_rows(rows[order], num_actions, discount, initial, features)
+
+
+def from_scipy(matrix, *, discount, initial=None, features=None) -> MDP:
+    """Builds a model from one sparse matrix with a row per state-action pair.
+
+    Args:
+      matrix: SciPy sparse, (S * A) x S; row s * A + a holds T(s, a, .): the actions of state 0 first, then those of
+        state 1. A is the number of rows divided by S.
+      discount: scalar, strictly between 0 and 1.
+      initial: [S] distribution of the first state; uniform if None.
+      features: [S, A, K] or [S, K]; no features (K = 0) if None.
+
+    Returns:
+      The model, in the dtype of `matrix`.
+
+    Raises:
+      ValueError: on a matrix that is not sparse or has another shape, naming row and column of the first entry that is
+        not finite or negative, or the first row that does not sum to 1; and as `MDP.from_successors`.
+    """
+    if not scipy.sparse.issparse(matrix):
+        raise ValueError(f"matrix must be a SciPy sparse matrix, got {type(matrix).__name__}")
+    good = matrix.ndim == 2 and min(matrix.shape) > 0 and matrix.shape[0] % matrix.shape[1] == 0
+    checks.require_shape("matrix", matrix, "(S * A, S) with S, A >= 1", good)
+    num_actions = matrix.shape[0] // matrix.shape[1]
+
+    def row_name(row):
+        return f"matrix row {row} (state {row // num_actions}, action {row % num_actions})"
+
+    rows = _checked_rows(scipy.sparse.csr_array(matrix), row_name)
+    return _from_rows(rows, num_actions, discount, initial, features)
+
+
+def _checked_rows(matrix, row_name: Callable[[int], str]):
+    """A copy with duplicates added up and no zeros, or a `ValueError` if a row is no distribution."""
+    if matrix.dtype.kind not in "iubf":
+        raise ValueError(f"{row_name(0).split()[0]} must hold real numbers, got dtype {matrix.dtype}")
+    keeps_type = matrix.dtype.kind == "f" and matrix.dtype.itemsize <= 8
+    matrix = matrix.astype(matrix.dtype if keeps_type else np.float64, copy=True)
+    matrix.sum_duplicates()
+    matrix.eliminate_zeros()
+    for bad, message in ((~np.isfinite(matrix.data), "be finite"), (matrix.data < 0, "not be negative")):
+        if np.any(bad):
+            entry = int(np.flatnonzero(bad)[0])
+            row = int(np.searchsorted(matrix.indptr, entry, side="right")) - 1
+            column = matrix.indices[entry]
+            raise ValueError(f"{row_name(row)}, column {column} must {message}, got {matrix.data[entry]}")
+    total = np.asarray(matrix.sum(axis=1, dtype=np.float64))
+    wrong = np.flatnonzero(~checks.sums_to_one(total, matrix.dtype))
+    if wrong.size:
+        raise ValueError(f"{row_name(int(wrong[0]))} must sum to 1, got {total[wrong[0]]}")
+    return matrix
+
+
+def _from_rows(rows, num_actions: int, discount, initial, features) -> MDP:
+    """A model from a CSR array with rows s * A + a."""
+    num_states = rows.shape[1]
+    lengths = np.diff(rows.indptr)
+    width = int(lengths.max())
+    checks.require_slots(num_states, num_actions, width)
+    pair = np.repeat(np.arange(len(lengths)), lengths)
+    slot = np.arange(rows.nnz) - np.repeat(rows.indptr[:-1], lengths)
+    next_state = np.zeros((len(lengths), width), np.int64)
+    probability = np.zeros((len(lengths), width), rows.dtype)
+    next_state[pair, slot], probability[pair, slot] = rows.indices, rows.data
+    shape = (num_states, num_actions, width)
+    return MDP.from_successors(
+        next_state.reshape(shape),
+        probability.reshape(shape),
+        discount=discount,
+        initial=initial,
+        features=features,
+    )

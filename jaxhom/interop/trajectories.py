@@ -1,0 +1,275 @@
+"""Demonstrations from the data of other libraries, from flat arrays of steps and from CSV files.
+
+Recorded episodes hold one observation more than actions: the last is where the episode ended, and no action was taken
+there. It is dropped, as an expert's advice needs both. Observations must be state indices, whole numbers from 0 on,
+each alone or in an array of one ([H, 1]); for anything else (one-hot vectors, tuples, coordinates) `to_states` says
+which state it is.
+
+An episode that cannot be used is dropped and the report says why; if nothing is left, that is an error. None of the
+libraries is imported: what counts is what the objects hold.
+"""
+
+import csv
+import dataclasses
+import os
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.demonstrations import Demonstrations
+from jaxhom.interop.files import FileError
+
+COLUMNS = ("episode", "state", "action")
+_FIELDS = (("obs", "acts"), ("observations", "actions"))
+_LARGEST_INDEX = 2**31 - 1
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportReport:
+    """What was read and what was dropped; `str` gives it in words.
+
+    Attributes:
+      episodes: episodes that were kept, M.
+      steps: steps in them.
+      final_observations: last observations without an action that were dropped from them.
+      dropped: pairs (episode, reason): the position, counted from 0, or the CSV file's name of an episode that was
+        dropped altogether.
+    """
+
+    episodes: int
+    steps: int
+    final_observations: int
+    dropped: tuple[tuple[int | str, str], ...]
+
+    def __str__(self) -> str:
+        lines = [f"{self.episodes} episodes, {self.steps} steps; {self.final_observations} final observations dropped"]
+        lines += [f"episode {episode} dropped: {reason}" for episode, reason in self.dropped]
+        return "\n".join(lines)
+
+
+def demonstrations_from_episodes(
+    episodes: Iterable, *, to_states: Callable | None = None
+) -> tuple[Demonstrations, ImportReport]:
+    """Reads episodes of `imitation`, of Minari, or as pairs of arrays.
+
+    Args:
+      episodes: M of them, or a data set with `iterate_episodes()` (Minari's). An episode is an object or a mapping with
+        `obs` and `acts` (imitation's trajectories) or `observations` and `actions` (Minari's), or a pair
+        (observations, actions). H actions go with H + 1 observations, or with H if the last is missing.
+      to_states: takes the observations of one episode as they are stored and returns as many state indices; for
+        one-hot vectors `lambda observations: observations.argmax(axis=-1)`.
+
+    Returns:
+      The demonstrations, and what was dropped: final observations, and episodes that are empty, have another number of
+      observations, or hold observations or actions that are no indices.
+
+    Raises:
+      ValueError: if there is no episode, something is not an episode, or none can be used (with the first reason).
+    """
+    kept, dropped, final = [], [], 0
+    for position, episode in enumerate(_iterate(episodes)):
+        observations, actions = _fields(position, episode)
+        try:
+            states, actions = _indices(observations, actions, to_states)
+        except ValueError as error:
+            dropped.append((position, str(error)))
+            continue
+        final += len(states) - len(actions)
+        kept.append((states[: len(actions)], actions))
+    return _finish(kept, dropped, final)
+
+
+def demonstrations_from_steps(
+    episode, observations, actions, *, to_states: Callable | None = None
+) -> tuple[Demonstrations, ImportReport]:
+    """Reads flat arrays with one step an entry, as offline data sets hold them.
+
+    Args:
+      episode: [T], which episode each step belongs to: any numbers or texts. Steps of one episode are in their order;
+        episodes may be interleaved. From flags that mark last steps: `numpy.cumsum(done) - done`.
+      observations: [T, ...], one observation per step.
+      actions: [T] or [T, 1].
+      to_states: as in `demonstrations_from_episodes`.
+
+    Returns:
+      The demonstrations, episodes in the order in which they begin (as the report counts them), and the report.
+
+    Raises:
+      ValueError: if the arrays differ in length, there is no step, or no episode can be used.
+    """
+    episode = checks.as_host_array("episode", episode)
+    checks.require_shape("episode", episode, "[T] with T >= 1", episode.ndim == 1 and episode.size > 0)
+    if episode.dtype.hasobject:
+        raise ValueError(f"episode must hold numbers or texts, got dtype {episode.dtype}")
+    arrays = {"observations": observations, "actions": actions}
+    arrays = {name: checks.as_host_array(name, array) for name, array in arrays.items()}
+    for name, array in arrays.items():
+        good = array.ndim >= 1 and len(array) == len(episode)
+        checks.require_shape(name, array, f"({len(episode)}, ...) like episode", good)
+    _, first, group = np.unique(episode, return_index=True, return_inverse=True)
+    group = np.argsort(np.argsort(first))[group]  # numbered in the order in which they begin
+    order = np.argsort(group, kind="stable")
+    cuts = np.flatnonzero(np.diff(group[order])) + 1
+    pieces = (np.split(array[order], cuts) for array in arrays.values())
+    return demonstrations_from_episodes(zip(*pieces, strict=True), to_states=to_states)
+
+
+def demonstrations_from_csv(path: str | os.PathLike) -> tuple[Demonstrations, ImportReport]:
+    """Reads a comma-separated file with one step a line.
+
+    The first line names the columns. Needed are `episode` (any text), `state` and `action` (whole numbers from 0 on);
+    others are ignored. Lines of one episode stand in the order of its steps; episodes may be interleaved. Blank lines
+    are skipped. An empty action marks the final observation of its episode.
+
+    Args:
+      path: the file, in UTF-8.
+
+    Returns:
+      The demonstrations, episodes in the order in which they begin, and the report: final observations, and episodes
+      that hold nothing else.
+
+    Raises:
+      FileError: if the file is missing or no text, lacks a column, or has a wrong field (naming line and column).
+    """
+    steps: dict[str, list[tuple[int, int | None]]] = {}
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, strict=True)
+            places = _places(path, next(reader, []))
+            for row in reader:
+                if row:
+                    episode, state, action = _step(path, reader.line_num, row, places)
+                    _append(path, reader.line_num, steps.setdefault(episode, []), state, action)
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
+    except OSError as error:
+        raise FileError(f"{path}: {error.strerror or error}") from None
+    except csv.Error as error:
+        raise FileError(f"{path} line {reader.line_num}: {error}") from None
+    kept, dropped, final = [], [], 0
+    for episode, pairs in steps.items():
+        acted = [pair for pair in pairs if pair[1] is not None]
+        if not acted:
+            dropped.append((episode, "it has no actions"))
+            continue
+        final += len(pairs) - len(acted)
+        kept.append(tuple(np.array(acted, np.int64).T))
+    try:
+        return _finish(kept, dropped, final)
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from None
+
+
+def _iterate(episodes) -> Iterable:
+    iterate = getattr(episodes, "iterate_episodes", None)
+    try:
+        return iter(iterate() if callable(iterate) else episodes)
+    except TypeError:
+        raise ValueError(f"episodes must be a sequence of episodes, got {type(episodes).__name__}") from None
+
+
+def _fields(position: int, episode) -> tuple:
+    """Observations and actions of an episode, whatever it is kept in."""
+    for names in _FIELDS:
+        if isinstance(episode, Mapping) and all(name in episode for name in names):
+            return tuple(episode[name] for name in names)
+        if all(hasattr(episode, name) for name in names):
+            return tuple(getattr(episode, name) for name in names)
+    if isinstance(episode, tuple | list) and len(episode) == 2:
+        return tuple(episode)
+    raise ValueError(
+        f"episode {position} must have obs and acts, or observations and actions, or be a pair of them; "
+        f"got {type(episode).__name__}"
+    )
+
+
+def _indices(observations, actions, to_states: Callable | None) -> tuple[np.ndarray, np.ndarray]:
+    """States [H] or [H + 1] and actions [H] of one episode, or a `ValueError` that says why it cannot be used."""
+    actions = _column("actions", actions)
+    if to_states is not None:
+        observations = to_states(observations)
+    states = _column("observations", observations)
+    if not len(actions):
+        raise ValueError("it has no actions")
+    if len(states) - len(actions) not in (0, 1):
+        raise ValueError(f"{len(actions)} actions need as many observations or one more, got {len(states)}")
+    states = checks.require_integers("observations", states, _LARGEST_INDEX)
+    return states, checks.require_integers("actions", actions, _LARGEST_INDEX)
+
+
+def _column(name: str, values) -> np.ndarray:
+    """[H] or [H, 1] as [H]."""
+    array = checks.as_host_array(name, values)
+    if array.ndim == 2 and array.shape[1] == 1:
+        array = array[:, 0]
+    remedy = "; to_states turns other observations into state indices" if name == "observations" else ""
+    if array.ndim != 1:
+        raise ValueError(f"{name} must have shape [H] or [H, 1], got {array.shape}{remedy}")
+    if not array.size:  # an empty list has no type of its own
+        return np.zeros(0, np.int64)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be whole numbers, got dtype {array.dtype}{remedy}")
+    return array
+
+
+def _finish(kept, dropped, final_observations: int) -> tuple[Demonstrations, ImportReport]:
+    if not kept:
+        if not dropped:
+            raise ValueError("there are no episodes")
+        raise ValueError(f"none of {len(dropped)} episodes can be used; episode {dropped[0][0]}: {dropped[0][1]}")
+    demonstrations = Demonstrations.from_trajectories(kept)
+    steps = sum(len(actions) for _, actions in kept)
+    report = ImportReport(
+        episodes=len(kept), steps=steps, final_observations=final_observations, dropped=tuple(dropped)
+    )
+    return demonstrations, report
+
+
+def _places(path, header: list[str]) -> list[int]:
+    """Where the columns stand that are needed."""
+    names = [name.strip().lower() for name in header]
+    for column in COLUMNS:
+        if names.count(column) != 1:
+            how = "is missing" if column not in names else "occurs twice"
+            found = ", ".join(map(repr, names)) or "nothing"
+            raise FileError(
+                f"{path} line 1: column {column!r} {how}; the first line must name the columns, got {found}"
+            )
+    return [names.index(column) for column in COLUMNS]
+
+
+def _step(path, line: int, row: list[str], places: list[int]) -> tuple[str, int, int | None]:
+    """Episode, state and action of one line; None for an empty action."""
+    if len(row) <= max(places):
+        raise FileError(f"{path} line {line}: {len(row)} fields, but the first line names more columns")
+    episode, state, action = (row[place].strip() for place in places)
+    if not episode:
+        raise FileError(f"{path} line {line}, column 'episode': is empty")
+    state = _whole_number(path, line, "state", state)
+    return episode, state, _whole_number(path, line, "action", action) if action else None
+
+
+def _whole_number(path, line: int, column: str, text: str) -> int:
+    is_plain = text.isascii() and text.isdigit() and len(text) < 16
+    number = int(text) if is_plain else _whole_float(text)
+    if number is None:
+        raise FileError(f"{path} line {line}, column {column!r}: must be a whole number, got {text!r}")
+    if not 0 <= number < _LARGEST_INDEX:
+        raise FileError(f"{path} line {line}, column {column!r}: must lie in [0, {_LARGEST_INDEX}), got {text}")
+    return int(number)
+
+
+def _whole_float(text: str) -> float | None:
+    """3.0 and the like, as programs write the integers of a column with empty fields; None for anything else."""
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if number.is_integer() and "_" not in text else None
+
+
+def _append(path, line: int, steps: list, state: int, action: int | None) -> None:
+    if steps and steps[-1][1] is None:
+        raise FileError(f"{path} line {line}: a step after its episode's final observation (a line without action)")
+    steps.append((state, action))

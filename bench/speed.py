@@ -15,7 +15,20 @@ import subprocess
 import sys
 
 FIELDS = (
-    *("work", "n", "m", "actions", "pairs", "method", "dtype", "device", "devices", "processes", "gap_asked"),
+    *(
+        "section",
+        "work",
+        "n",
+        "m",
+        "actions",
+        "pairs",
+        "method",
+        "dtype",
+        "device",
+        "devices",
+        "processes",
+        "gap_asked",
+    ),
     *("gap_certified", "settled", "compile_s", "build_s", "seconds", "ms_per_pair", "gflops", "peak_fraction"),
     *("gbytes_per_s", "status", "note", "versions", "commit"),
 )
@@ -37,7 +50,7 @@ def run_section(section: str, quick: bool) -> list[dict]:
     if found.returncode:
         reason = (found.stderr.strip().splitlines() or ["no message"])[-1]
         rows.append({"work": section, "status": "failed", "note": reason})
-    return rows
+    return [{"section": section} | row for row in rows]
 
 
 def read(path: pathlib.Path) -> list[dict]:
@@ -182,12 +195,13 @@ def report(path: pathlib.Path) -> None:
 def similarity(arguments: argparse.Namespace) -> None:
     """Measures, writes rows after every section, and reports."""
     if not arguments.report:
-        rows: list[dict] = []
-        for section in QUICK if arguments.quick else SIMILARITY:
-            if arguments.sections and section not in arguments.sections:
-                continue
+        wanted = arguments.sections or (QUICK if arguments.quick else SIMILARITY)
+        rows = read(arguments.output) if arguments.sections and arguments.output.exists() else []
+        for section in wanted:
             print(section, file=sys.stderr, flush=True)
-            rows += run_section(section, arguments.quick)
+            found = run_section(section, arguments.quick)
+            rows = [row for row in rows if row["section"] != section] + found
+            rows.sort(key=lambda row: SIMILARITY.index(row["section"]))
             write(arguments.output, rows)
     report(arguments.output)
 
@@ -198,7 +212,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("similarity", help="local and global homomorphisms, against other LP solvers")
     command.add_argument("--quick", action="store_true", help="a handful of pairs, to see that it runs")
-    command.add_argument("--sections", nargs="+", choices=SIMILARITY, help="only these")
+    command.add_argument("--sections", nargs="+", choices=SIMILARITY, help="only these; rows of others stay")
     command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
     command.add_argument("--output", type=pathlib.Path, default=pathlib.Path("bench/results/speed_similarity.csv"))
     command.set_defaults(run=similarity)

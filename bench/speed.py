@@ -29,7 +29,17 @@ FIELDS = (
         "processes",
         "gap_asked",
     ),
-    *("gap_certified", "settled", "compile_s", "build_s", "seconds", "ms_per_pair", "gflops", "peak_fraction"),
+    *(
+        "gap_asked",
+        "gap_certified",
+        "settled",
+        "compile_s",
+        "build_s",
+        "seconds",
+        "ms_per_pair",
+        "gflops",
+        "peak_fraction",
+    ),
     *("gbytes_per_s", "status", "note", "versions", "commit"),
 )
 SIMILARITY = (

@@ -16,6 +16,7 @@ PACKAGE = ROOT / "jaxhom"
 # Inside a package (pdhg, lpal, domains, interop, plotting, cli) the modules may import one another, one way.
 ROWS = {
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
+    "canonical_forms": -1,  # arrays in, keys out
     "mdp": 0,
     "occupancy": 1,
     "planning": 1,
@@ -27,8 +28,13 @@ ROWS = {
     "brackets": 1.6,
     "homomorphism": 2,
     "homomorphism_map": 2,
+    "certified_maps": 2,
     "lpal": 2,
+    "votes": 2,
+    "explanation": 2.3,
+    "explainers": 2.6,
     "generalization": 3,
+    "global_homomorphism": 3.5,
     "occupancy_regression": 3.5,
     "evaluation": 4,
     "domains": 4,

@@ -21,7 +21,7 @@ METHODS = ("auto", "pdhg", "interior_point")
 _MAX_LANES = 64
 _BATCH_BYTES = 32 * 2**20
 _CHUNK_PAIRS = 16_384
-MAX_INTERIOR_SIZE = 16  # larger models: the normal matrix, (n m)^2, is slower than PDHG
+MAX_INTERIOR_SIZE = 32  # larger models: the normal matrix has (n m)^2 entries
 _INTERIOR_BYTES = 4 * 2**20
 
 

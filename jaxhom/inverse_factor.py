@@ -8,13 +8,16 @@ hands one matrix at a time to LAPACK: its threads and those of XLA get into each
 import jax
 import jax.numpy as jnp
 
+_MIN_LEAF = 10
 
-def inverse_factor(matrix: jax.Array, leaf: int = 10) -> jax.Array:
+
+def inverse_factor(matrix: jax.Array, leaf: int | None = None) -> jax.Array:
     """W = L^-1 with N = L L^T, so that N^-1 = W^T W.
 
     Args:
       matrix: N [D, D], symmetric positive definite.
-      leaf: sizes up to this one are eliminated column by column; larger ones are cut in two:
+      leaf: sizes up to this one (by default a twelfth, 10 at least) are eliminated column by column; larger ones are
+        cut in two:
 
             [ N11  N21^T ]    L21 = N21 W11^T,         W = [ W11             0   ]
             [ N21  N22   ],   S = N22 - L21 L21^T,         [ -W22 L21 W11    W22 ].
@@ -23,6 +26,7 @@ def inverse_factor(matrix: jax.Array, leaf: int = 10) -> jax.Array:
       W [D, D], lower triangular; NaN where the matrix is not positive definite.
     """
     size = len(matrix)
+    leaf = leaf or max(_MIN_LEAF, -(-size // 12))
     if size <= leaf:
         return _eliminate(matrix)
     half = leaf * -(-size // (2 * leaf))

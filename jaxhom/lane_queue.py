@@ -187,5 +187,10 @@ def _run(solver: Solver, problem, state, threshold, used, tolerance, max_iterati
         done = is_done(state)
         return (done & (jnp.arange(done.size) < used)).sum() < _STOP_FRACTION * used
 
-    state = jax.lax.while_loop(keep_going, lambda s: solver.step(problem, s), state)
+    def advance(state):
+        # Finished lanes stay as they are: an answer does not depend on the lanes beside it.
+        done = is_done(state)
+        return jax.tree.map(lambda old, new: jnp.where(done, old, new), state, solver.step(problem, state))
+
+    state = jax.lax.while_loop(keep_going, advance, state)
     return state, is_done(state)

@@ -34,6 +34,7 @@ from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
 _SMALL = 8  # local models up to this size share one padding
 _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
+_CHUNK_LANES = 32  # of `homomorphism_error` under vmap
 _CHUNK_BYTES = 256 * 2**20
 _MAX_ITERATIONS = 100_000
 
@@ -302,7 +303,7 @@ def _optimal_pair(source, target, anchored) -> tuple[jax.Array, jax.Array, jax.A
 
     @jax.custom_batching.custom_vmap
     def solve_batch(sources, targets):
-        return _solve_batch(sources, targets, anchored)
+        return _solve_in_chunks(sources, targets, anchored)
 
     @solve_batch.def_vmap
     def _merge_axes(axis_size, in_batched, sources, targets):
@@ -319,6 +320,17 @@ def _optimal_pair(source, target, anchored) -> tuple[jax.Array, jax.Array, jax.A
     return jax.tree.map(lambda leaf: leaf[0], solve_batch(source[None], target[None]))
 
 
+def _solve_in_chunks(sources, targets, anchored):
+    """`_solve_batch` a few instances at a time: they fit into the cache, and wait for the slowest of the few."""
+    lanes = len(sources)
+    if lanes <= _CHUNK_LANES:
+        return _solve_batch(sources, targets, anchored)
+    order = jnp.arange(-(-lanes // _CHUNK_LANES) * _CHUNK_LANES) % lanes  # the surplus repeats the first
+    chunks = tuple(array[order].reshape(-1, _CHUNK_LANES, *array.shape[1:]) for array in (sources, targets))
+    found = jax.lax.map(lambda chunk: _solve_batch(*chunk, anchored), chunks)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:lanes], found)
+
+
 def _solve_batch(sources, targets, anchored):
     """[B, n, A, n], [B, m, A, m] -> e [B], f [B, n, m], y [B, n, A, m]."""
     lanes, n = sources.shape[:2]
@@ -331,15 +343,20 @@ def _solve_batch(sources, targets, anchored):
         anchored=anchored,
     )
     tolerance = 1e-6 if sources.dtype == jnp.float64 else 1e-4
-    state = engine.init(problem)
+
+    def by_pdhg(start=None):
+        state = engine.solve(problem, engine.init(problem, start), tolerance=tolerance, max_iterations=_MAX_ITERATIONS)
+        return 0.5 * (state.lower + state.upper), state.best_primal, state.best_dual
+
     if suits_interior_point(problem.source, problem.target, tolerance):
-        # PDHG finishes what is left open, which takes no iteration where nothing is.
         near = interior_point.solve(problem, tolerance=tolerance)
-        points = {"best_primal": near.f, "best_dual": near.plus - near.minus}
-        state = state.replace(lower=near.lower, upper=near.upper, primal=near.f, anchor_primal=near.f, **points)
-    state = engine.solve(problem, state, tolerance=tolerance, max_iterations=_MAX_ITERATIONS)
-    error = 0.5 * (state.lower + state.upper)
-    return error, jnp.moveaxis(state.best_primal, -1, 0), jnp.moveaxis(state.best_dual, -1, 0)
+        f, y = near.f, near.plus - near.minus
+        found = (0.5 * (near.lower + near.upper), f, y)
+        is_settled = (near.upper - near.lower <= tolerance).all()
+        error, f, y = jax.lax.cond(is_settled, lambda: found, lambda: by_pdhg((f, y)))
+    else:
+        error, f, y = by_pdhg()
+    return error, jnp.moveaxis(f, -1, 0), jnp.moveaxis(y, -1, 0)
 
 
 def _size_groups(sizes: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import json
 import statistics
 import subprocess
 import time
+from collections.abc import Iterator
 from importlib import metadata
 
 import jax
@@ -35,8 +36,11 @@ THRESHOLD = 0.05
 GLOBAL_GAP = 1e-3
 SIZES = (3, 5, 8, 13, 25)
 OUR_PAIRS = {3: 2048, 5: 2048, 8: 512, 13: 128, 25: 32}
-PEER_PAIRS = {3: 512, 5: 512, 8: 128, 13: 48, 25: 4}
-MPAX_PAIRS = {3: 64, 5: 64, 8: 32, 13: 8}  # larger ones take minutes
+PEER_PAIRS = {  # larger ones take a peer minutes
+    "highs_simplex": {3: 512, 5: 512, 8: 64, 13: 4},
+    "mpax": {3: 64, 5: 64, 8: 32, 13: 8},
+    "others": {3: 512, 5: 512, 8: 128, 13: 32, 25: 2},
+}
 MAX_PDHG_SIZE = 8  # tight brackets of larger random models take it a tenth of a second a pair, and more
 OUR_COUNTS = (1, 8, 64, 512, 4096, 32768)
 PEER_COUNTS = (1, 8, 64, 512)
@@ -221,17 +225,13 @@ def peer_pairs(method: str, n: int, count: int, work: str = "brackets") -> dict:
     return row(work, method, count, answer.seconds, **fields)
 
 
-def section_peers(quick: bool) -> list[dict]:
+def section_peers(quick: bool) -> Iterator[dict]:
     """Random pairs of every size, each peer."""
-    rows = []
     for n in (3, 5) if quick else SIZES:
         for method in peers.MODULES:
-            pairs = MPAX_PAIRS if method == "mpax" else PEER_PAIRS
-            if quick and not method.startswith("highs"):
-                continue
-            if n in pairs:
-                rows.append(peer_pairs(method, n, 8 if quick else pairs[n]))
-    return rows
+            count = PEER_PAIRS.get(method, PEER_PAIRS["others"]).get(n)
+            if count and (method.startswith("highs") or not quick):
+                yield peer_pairs(method, n, 8 if quick else count)
 
 
 # ------------------------------------------------------------------------------------------------------ whole problems
@@ -430,7 +430,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
     for found in SECTIONS[arguments.section](arguments.quick):
-        print("ROW " + json.dumps(found))
+        print("ROW " + json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":

@@ -55,11 +55,15 @@ _MARKERS = "osD^vP*X"
 def run_section(section: str, quick: bool) -> list[dict]:
     """Rows of one section, measured in a process of its own; a section that fails is a row too."""
     command = [sys.executable, "-m", "bench.similarity_speed", section] + ["--quick"] * quick
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
-    rows = [json.loads(line[4:]) for line in found.stdout.splitlines() if line.startswith("ROW ")]
-    if found.returncode:
-        reason = (found.stderr.strip().splitlines() or ["no message"])[-1]
-        rows.append({"work": section, "status": "failed", "note": reason})
+    rows = []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            if line.startswith("ROW "):
+                rows.append(json.loads(line.removeprefix("ROW ")))
+                shown = (rows[-1].get(name, "") for name in ("work", "method", "dtype", "n", "pairs", "ms_per_pair"))
+                print("  ", *shown, file=sys.stderr, flush=True)
+    if process.returncode:
+        rows.append({"work": section, "status": "failed", "note": f"exit code {process.returncode}"})
     return [{"section": section} | row for row in rows]
 
 

@@ -22,7 +22,9 @@ _MAX_LANES = 64
 _BATCH_BYTES = 32 * 2**20
 _CHUNK_PAIRS = 16_384
 MAX_INTERIOR_SIZE = 32  # larger models: the normal matrix has (n m)^2 entries
-_INTERIOR_BYTES = 4 * 2**20
+_MAX_INTERIOR_LANES = 128
+_FEW_LANES = 16
+_INTERIOR_BYTES = 2 * 2**20
 
 
 @chex.dataclass(frozen=True)
@@ -179,14 +181,17 @@ def _is_settled(lower, upper, tolerance, threshold) -> np.ndarray:
 def _pdhg_lanes(problem) -> int:
     """Both models and the six pairs of points that the engine keeps have to fit into the cache."""
     n, num_actions, m = *problem.source.shape[:2], problem.target.shape[0]
-    return _fitting_lanes(problem, num_actions * (n * n + m * m + 6 * n * m) + 6 * n * m, _BATCH_BYTES)
+    entries = num_actions * (n * n + m * m + 6 * n * m) + 6 * n * m
+    return _fitting_lanes(problem, entries, _BATCH_BYTES, _MAX_LANES)
 
 
 def _interior_lanes(problem) -> int:
-    """A few normal matrices have to."""
-    return _fitting_lanes(problem, (problem.source.shape[0] * problem.target.shape[0]) ** 2, _INTERIOR_BYTES)
+    """A few normal matrices have to; a handful of pairs need no more lanes than that."""
+    entries = (problem.source.shape[0] * problem.target.shape[0]) ** 2
+    most = _FEW_LANES if problem.source.shape[-1] <= _FEW_LANES else _MAX_INTERIOR_LANES
+    return _fitting_lanes(problem, entries, _INTERIOR_BYTES, most)
 
 
-def _fitting_lanes(problem, entries: int, num_bytes: int) -> int:
+def _fitting_lanes(problem, entries: int, num_bytes: int, most: int) -> int:
     fitting = max(1, num_bytes // (entries * problem.source.dtype.itemsize))
-    return int(min(_MAX_LANES, 2 ** int(np.log2(fitting))))
+    return int(min(most, 2 ** int(np.log2(fitting))))

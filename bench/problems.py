@@ -6,6 +6,7 @@ draw is therefore the same whatever the batch, the method, or what was computed 
 
 import dataclasses
 import functools
+import operator
 import pathlib
 import zlib
 
@@ -46,7 +47,7 @@ class Problem:
 
     Attributes:
       reward: [B, S, A]. expert: plans with a leading axis [B].
-      demonstrations: B of them, up to the finish on tracks.
+      demonstrations: B of them; see `_shown`.
       models: what the learner of each draw knows of the model; the true one unless the setting says otherwise.
       trial_keys: [B], for sampled trials.
       found: results that several methods build on.
@@ -84,7 +85,7 @@ def draw_problem(setting: Setting, draws: tuple[int, ...], seed: int) -> Problem
         draws=tuple(draws),
         reward=reward,
         expert=expert,
-        demonstrations=[_shown(setting, domain, samples, lane) for lane in range(len(draws))],
+        demonstrations=_shown(setting, domain, samples),
         models=[_known_model(setting, domain, key) for key in model_keys],
         trial_keys=trial_keys,
     )
@@ -138,22 +139,16 @@ def _sample(keys, mdp, policies, num_trajectories, length) -> Demonstrations:
     )
 
 
-def _shown(setting: Setting, domain: Domain, samples: Demonstrations, lane: int) -> Demonstrations:
-    """The trajectories that the learner of a lane sees.
+def _shown(setting: Setting, domain: Domain, samples: Demonstrations) -> list[Demonstrations]:
+    """The trajectories that the learner of each draw sees, all of one shape.
 
-    On tracks they are cut at the finish: what the car does on the finish line is no decision of the expert's.
+    On tracks without the steps from the finish line, which put the car back: the action there is no decision of the
+    expert's.
     """
-    first = jax.tree.map(lambda leaf: leaf[lane, : setting.demonstrations], samples)
-    if domain.terminal is None:
-        return first
-    pieces = []
-    for states, actions in zip(np.asarray(first.states), np.asarray(first.actions), strict=True):
-        ends = np.flatnonzero(np.asarray(domain.terminal)[states])
-        runs = zip(np.split(states, ends), np.split(actions, ends), strict=True)
-        # Each run but the first begins on the finish line.
-        kept = [(s[i > 0 :], a[i > 0 :]) for i, (s, a) in enumerate(runs)]
-        pieces += [(s, a) for s, a in kept if len(s)]
-    return Demonstrations.from_trajectories(pieces)
+    seen = jax.tree.map(lambda leaf: leaf[:, : setting.demonstrations], samples)
+    if domain.terminal is not None:
+        seen = seen.replace(mask=seen.mask & ~domain.terminal[seen.states])
+    return [jax.tree.map(operator.itemgetter(lane), seen) for lane in range(len(seen.mask))]
 
 
 def _known_model(setting: Setting, domain: Domain, key) -> MDP:

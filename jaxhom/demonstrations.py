@@ -21,7 +21,8 @@ class Demonstrations:
     Attributes:
       states: int32 [M, H], the state of each step; 0 on padding.
       actions: int32 [M, H], the action taken there; 0 on padding.
-      mask: bool [M, H], True on the steps that happened, a prefix of every row.
+      mask: bool [M, H], True on the steps that happened, a prefix of every row. Taking steps out of it, such as those
+        of a car that is put back to the start, hides them from the learner and leaves the times of the others.
     """
 
     states: jax.Array

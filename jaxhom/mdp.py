@@ -38,8 +38,8 @@ class PaddedRows:
 
     Attributes:
       narrow: int32 [R, W], the first W entries of every row; `sentinel` where a row is shorter.
-      wide_row: int32 [J], the rows that go on.
-      wide: int32 [J, V], their further entries; `sentinel` where a row is shorter.
+      wide_row: int32 [J], the rows that go on; once for every V further entries.
+      wide: int32 [J, V], those entries; `sentinel` where a row is shorter.
     """
 
     narrow: jax.Array
@@ -291,11 +291,13 @@ def _gather_sum(index: jax.Array, weight: jax.Array, values: jax.Array) -> jax.A
     """sum_n weight[..., n] values[index[..., n]], with `values` [R] or [R, B]; unrolled while n is small."""
     spread = (..., None) if values.ndim == 2 else ...
     if index.shape[-1] > _MAX_UNROLL:
-        letters = "rnb" if values.ndim == 2 else "rn"
-        flat_index = index.reshape(-1, index.shape[-1])
-        flat_weight = weight.reshape(flat_index.shape)
-        total = jnp.einsum(f"rn,{letters}->{letters.replace('n', '')}", flat_weight, values[flat_index])
-        return total.reshape(index.shape[:-1] + values.shape[1:])
+        values = jnp.asarray(values)
+        # A loop over blocks of terms, each one fused pass: the gathered numbers never go through memory.
+        padding = [(0, 0)] * (index.ndim - 1) + [(0, -index.shape[-1] % _MAX_UNROLL)]
+        blocks = (*index.shape[:-1], -1, _MAX_UNROLL)
+        stacked = [jnp.moveaxis(jnp.pad(array, padding).reshape(blocks), -2, 0) for array in (index, weight)]
+        total = jnp.zeros(index.shape[:-1] + values.shape[1:], jnp.result_type(weight, values))
+        return jax.lax.scan(lambda total, block: (total + _gather_sum(*block, values), None), total, stacked)[0]
     return sum(weight[..., n][spread] * values[index[..., n]] for n in range(index.shape[-1]))
 
 
@@ -383,12 +385,14 @@ def _transpose(next_state: np.ndarray, probability: np.ndarray) -> PaddedRows:
     entry, target = entry[order], target[order]
     counts = np.bincount(target, minlength=num_states)
     slot = np.arange(len(entry)) - (np.cumsum(counts) - counts)[target]
-    width, longest = _narrow_width(counts), int(counts.max())
-    wide_row = np.flatnonzero(counts > width)
+    width = _narrow_width(counts)
     narrow = np.full((num_states, width), sentinel, np.int32)
-    wide = np.full((len(wide_row), longest - width), sentinel, np.int32)
     inside = slot < width
     narrow[target[inside], slot[inside]] = entry[inside]
-    position = np.searchsorted(wide_row, target[~inside])
-    wide[position, slot[~inside] - width] = entry[~inside]
+    pieces = -(-np.maximum(counts - width, 0) // _MAX_UNROLL)  # a few rows may be far longer than the other long ones
+    first_piece = np.cumsum(pieces) - pieces
+    wide = np.full((pieces.sum(), _MAX_UNROLL), sentinel, np.int32)
+    piece, place = np.divmod(slot[~inside] - width, _MAX_UNROLL)
+    wide[first_piece[target[~inside]] + piece, place] = entry[~inside]
+    wide_row = np.repeat(np.arange(num_states), pieces)
     return PaddedRows(narrow=narrow, wide_row=wide_row.astype(np.int32), wide=wide)

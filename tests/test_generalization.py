@@ -253,6 +253,18 @@ def test_the_global_map():
     assert np.all(result.policy >= low - 1e-9) and np.all(result.policy <= high + 1e-9)
 
 
+def test_the_global_error_on_a_6x6_grid(rng):
+    """LP (8) against HiGHS, with a sixth of the states demonstrated."""
+    transition = oracles.gridworld_transition(6)
+    trajectories = [(np.array([0, 1, 7, 8]), rng.integers(4, size=4)), (np.array([35, 34]), rng.integers(4, size=2))]
+    mdp = MDP.from_dense(transition, discount=0.9)
+    result = soft_homomorphism(mdp, Demonstrations.from_trajectories(trajectories), tolerance=1e-3)
+    visited = np.isin(np.arange(36), [0, 1, 7, 8, 34, 35])
+    error, _ = oracles.global_homomorphism_lp(transition, visited)
+    assert result.error_lower - 1e-9 <= error <= result.error_upper + 1e-9
+    assert result.error_upper - result.error_lower <= 1e-3 and 0.05 < error < 0.95
+
+
 # ---------------------------------------------------------------------------- where nothing is found
 
 METHODS = {

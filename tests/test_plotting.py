@@ -11,13 +11,14 @@ import pytest
 matplotlib = pytest.importorskip("matplotlib")
 matplotlib.use("Agg")
 
+import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib import collections  # noqa: E402
 from matplotlib.colors import to_rgba  # noqa: E402
 
 from jaxhom import plotting  # noqa: E402
 from jaxhom.demonstrations import Demonstrations  # noqa: E402
 from jaxhom.domains import gridworld, racetrack  # noqa: E402
-from jaxhom.plotting import plt  # noqa: E402
+from jaxhom.plotting import figures, pictures  # noqa: E402
 
 TRACK = ["XXXXXX", "S....F", "S..XXX", "XXXXXX"]
 CELLS, OPEN = 9, 8  # of which one is on the finish line
@@ -291,14 +292,14 @@ def test_off_roads_are_told_from_halts(track):
     ]
     for here, action, after, expected in steps:
         states = np.array([here, after])
-        (chance,) = plotting._off_road_chances(track, states, np.array([action]))
+        (chance,) = figures._off_road_chances(track, states, np.array([action]))
         np.testing.assert_allclose(chance, expected, atol=1e-12)
 
 
 def test_the_median_trial_is_in_the_middle(track):
-    trial = plotting._median_trial(jax.random.key(1), track, uniform(track), 6)
+    trial = figures._median_trial(jax.random.key(1), track, uniform(track), 6)
     assert trial.states.shape == (1, 7)
-    (states,) = plotting._unpadded(trial)
+    (states,) = pictures.unpadded(trial)
     assert not np.asarray(track.terminal)[states[:-1]].any()
 
 

@@ -8,9 +8,10 @@ import dataclasses
 
 import numpy as np
 
+from jaxhom.lane_queue import solve_many
 from jaxhom.local_models import isomorphism, local_models, model_rounding
 from jaxhom.mdp import MDP
-from jaxhom.pdhg import Status, engine, solve_many
+from jaxhom.pdhg import SOLVER, PDHGState, Status, engine
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem, plain_forward
 
 _LANES = 8
@@ -83,7 +84,8 @@ def _solve(from_models, to_models, pairs: np.ndarray, anchored: bool, result: Ce
     source, target = _padded(from_models, pairs), _padded(to_models, pairs)
     tolerance = 1e-6 if source.dtype == np.float64 else 1e-4
     per_iteration = 2 * source.shape[1] * len(source) * len(target) * (len(source) + len(target))
-    state = solve_many(
+    found = solve_many(
+        SOLVER,
         HomomorphismProblem(
             source=source,
             target=target,
@@ -95,6 +97,7 @@ def _solve(from_models, to_models, pairs: np.ndarray, anchored: bool, result: Ce
         max_iterations=int(np.clip(_MAX_PRODUCTS / per_iteration, engine.STEPS_PER_CHECK, _MAX_ITERATIONS)),
         lanes=_LANES,
     )
+    state = PDHGState(**found)
     result.lower[pairs], result.upper[pairs] = np.maximum(state.lower, 0.0), state.upper
     result.maps[pairs] = np.moveaxis(state.best_primal, -1, 0)[:, :n, :m]
     result.status[pairs] = np.where(engine.is_settled(state, tolerance), Status.SOLVED, Status.ITERATION_LIMIT)

@@ -18,15 +18,15 @@ try:
 except ImportError as error:
     raise ImportError("jaxhom.plotting needs matplotlib, which is not installed: pip install 'jaxhom[plot]'") from error
 
-from jaxhom.plotting.certificates import plot_certificate
+from jaxhom.plotting.certificates import plot_bounds, plot_certificate
 from jaxhom.plotting.figures import learned_policy_figure
+from jaxhom.plotting.generalizations import plot_generalization, plot_radius, plot_support
 from jaxhom.plotting.palette import AMOUNT, BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from jaxhom.plotting.pictures import (
     plot_gridworld,
     plot_occupancy,
     plot_policy,
     plot_racetrack,
-    plot_radius,
     plot_trajectories,
 )
 
@@ -41,11 +41,14 @@ __all__ = [
     "VERMILLION",
     "YELLOW",
     "learned_policy_figure",
+    "plot_bounds",
     "plot_certificate",
+    "plot_generalization",
     "plot_gridworld",
     "plot_occupancy",
     "plot_policy",
     "plot_racetrack",
     "plot_radius",
+    "plot_support",
     "plot_trajectories",
 ]

@@ -22,7 +22,7 @@ from jaxhom.domains.tile_map import TileMap
 from jaxhom.mdp import MDP
 from jaxhom.plotting.palette import AMOUNT, FAINT, INK, ROAD, START, WALL
 
-BAR_ROOM = 0.9  # inches beside the map
+BAR_ROOM, LEVEL_ROOM = 1.2, 2.0  # inches beside the map, for a colour bar with numbers and one with names
 
 _CHECKER = 4  # chequers along the side of a finish cell
 _LEAST_PROBABILITY = 0.02  # of an action that gets an arrow
@@ -67,9 +67,19 @@ class Board:
             return states
         return states + self.domain.state_of(self.cells[0], speed)
 
+    def side(self, values: np.ndarray) -> int:
+        """Pixels along the side of a cell: 1 for values per cell [C], 5 for values per state [S] of a track."""
+        return round((len(values) / self.num_cells) ** 0.5)
+
+    def centres(self, values: np.ndarray) -> np.ndarray:
+        """Where the pixels of [C] or [S] values are, (x, y) [C, 2] or [S, 2]."""
+        side = self.side(values)
+        shift = (np.stack(np.divmod(np.arange(side**2), side), axis=1) - (side - 1) / 2) / side
+        return (self.cells[:, None] + shift).reshape(-1, 2)[:, ::-1]
+
     def image(self, values: np.ndarray, fill=np.nan) -> np.ndarray:
         """[C] or [S] -> one pixel per cell, or a square of pixels per cell; `fill` off the map."""
-        side = round((len(values) / self.num_cells) ** 0.5)
+        side = self.side(values)
         dtype = np.result_type(values, fill)
         tiles = np.full((*self.shape, side, side), fill, dtype)
         tiles[tuple(self.cells.T)] = values.reshape(self.num_cells, side, side)
@@ -166,12 +176,12 @@ def show(ax: Axes, board: Board, values: np.ndarray, **style):
     return ax.imshow(image, extent=_extent(board), interpolation="nearest", zorder=1, **style)
 
 
-def colorbar(ax: Axes, board: Board, image, label: str):
+def colorbar(ax: Axes, board: Board, image, label: str, **style):
     """A colour bar as high as the map and as wide as fits it."""
     rows, columns = board.shape
     width = 0.04 * max(rows, 16) / max(columns, 16)
     place = ax.inset_axes([1.0 + width / 2, 0.0, width, 1.0])
-    bar = ax.figure.colorbar(image, cax=place, label=label)
+    bar = ax.figure.colorbar(image, cax=place, label=label, **style)
     bar.outline.set_visible(False)
     return bar
 
@@ -197,7 +207,7 @@ def draw_arrows(ax: Axes, board: Board, policy: np.ndarray, color: str) -> None:
     shown = arrow.any(axis=-1)
     tail = np.broadcast_to(tail, arrow.shape)[shown]
     y, x, dy, dx = np.concatenate([tail, arrow[shown]], axis=-1).T
-    style = {"width": 0.075, "headwidth": 3.8, "headlength": 3.8, "headaxislength": 3.4}
+    style = {"width": 0.075, "headwidth": 3.6, "headlength": 3.2, "headaxislength": 2.9}
     placed = {"angles": "xy", "units": "xy", "scale_units": "xy", "scale": 1.0}
     ax.quiver(x, y, dx, dy, color=color, zorder=4, **placed, **style)
     cell, action = np.nonzero((policy > 0) & ~board.moves.any(axis=-1))

@@ -1,29 +1,24 @@
-"""Pictures of domains, policies, trajectories, occupancies and radii, each on axes that are given or new."""
+"""Pictures of domains, policies, trajectories and occupancies, each on axes that are given or new."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import colors
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
-from jaxhom import checks
 from jaxhom.demonstrations import Demonstrations
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import Racetrack
 from jaxhom.plotting.boards import (
     BAR_ROOM,
     board_of,
-    borders_of,
-    colorbar,
     draw_arrows,
     ground,
     heat,
     policy_at,
     require,
-    show,
 )
-from jaxhom.plotting.palette import INK, PURPLE, TINT, VERMILLION
+from jaxhom.plotting.palette import INK, TINT, VERMILLION
 
 _DECADES = 4  # of an occupancy that are told apart
 _SPREAD = 0.4  # width of the lane, in cells, that several trajectories share
@@ -214,46 +209,6 @@ def plot_occupancy(
     scale = colors.LogNorm(vmin=least, vmax=largest)
     ax = ground(board, ax, BAR_ROOM)
     heat(ax, board, np.where(visits < least, np.nan, visits), label, norm=scale)
-    return ax
-
-
-def plot_radius(domain: Gridworld | Racetrack, radius, *, ax: Axes | None = None) -> Axes:
-    """Colours states by the radius at which Algorithm 1 stopped: how far the expert's advice came.
-
-    On a racetrack every cell is a mosaic of its 25 states: row speed -2 ... 2 from top to bottom,
-    column speed -2 ... 2 from left to right.
-
-    Args:
-      domain: a gridworld or a racetrack.
-      radius: int [S], `Generalization.radius`: 0 on demonstrated states, -1 where nothing was
-        found; these two have colours of their own, the others a scale.
-      ax: axes to draw on; new ones if None.
-
-    Returns:
-      The axes.
-
-    Raises:
-      ValueError: if the shape does not fit the domain, or an entry is below -1 or not whole.
-    """
-    board = board_of(domain)
-    radius = require("radius", radius, (board.num_states,))
-    whole = (radius == np.floor(radius)) & (radius >= -1)
-    checks.require_all("radius", radius, whole, "must be whole and at least -1")
-    largest = max(int(radius.max()), 1)
-    levels = plt.get_cmap("cividis_r")(np.linspace(0.0, 1.0, largest))
-    palette = colors.ListedColormap([colors.to_rgba(PURPLE), colors.to_rgba(VERMILLION), *levels])
-    scale = colors.BoundaryNorm(np.arange(-1, largest + 2) - 0.5, palette.N)
-    ax = ground(board, ax, 1.6 * BAR_ROOM)
-    image = show(ax, board, radius, cmap=palette, norm=scale)
-    bar = colorbar(ax, board, image, "")
-    shown = np.arange(1, largest + 1, -(-largest // 8))
-    names = ["nothing found", "demonstrated", f"{shown[0]} step away", *map(str, shown[1:])]
-    bar.set_ticks([-1, 0, *shown], labels=names)
-    bar.minorticks_off()
-    bar.ax.tick_params(length=0)
-    if board.per_cell > 1:
-        borders = borders_of(board, np.arange(board.num_cells))
-        ax.add_collection(LineCollection(borders, colors="white", linewidths=0.8, zorder=2))
     return ax
 
 

@@ -23,10 +23,10 @@ import numpy as np  # noqa: E402
 import jaxhom  # noqa: E402
 from bench import peers  # noqa: E402
 from jaxhom.brackets import MAX_INTERIOR_SIZE, bracket_errors  # noqa: E402
-from jaxhom.generalization import GlobalHomomorphismProblem, restricted_model  # noqa: E402
 from jaxhom.homomorphism import ClassSimilarity  # noqa: E402
-from jaxhom.local_models import local_model_classes  # noqa: E402
+from jaxhom.local_models import local_model_classes, restricted_model  # noqa: E402
 from jaxhom.pdhg import engine  # noqa: E402
+from jaxhom.pdhg.global_homomorphism_lp import GlobalHomomorphismProblem  # noqa: E402
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem  # noqa: E402
 
 NUM_ACTIONS = 4

@@ -16,13 +16,14 @@ from jaxhom.demonstrations import (
 )
 from jaxhom.domains import Gridworld, Racetrack, gridworld, racetrack, sample_weights
 from jaxhom.evaluation import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
+from jaxhom.explanation import Explanation
 from jaxhom.generalization import (
     Generalization,
     maximum_entropy,
     nearest_neighbors,
-    soft_homomorphism,
     soft_local_homomorphism,
 )
+from jaxhom.global_homomorphism import soft_homomorphism
 from jaxhom.homomorphism import (
     homomorphism_error,
     local_similarity,
@@ -42,6 +43,7 @@ __all__ = [
     "MDP",
     "Demonstrations",
     "Evaluation",
+    "Explanation",
     "Generalization",
     "Gridworld",
     "LPALSolution",

@@ -6,29 +6,41 @@ action frequencies, elsewhere what the method makes of them.
 Algorithm 1 of Boularias and Chaib-draa 2010 (`soft_local_homomorphism`) grows the set s^t of states within t steps
 of an unvisited state s. At the first t at which s^t holds a demonstrated state that is locally similar to s, all
 such states vote with their empirical policies. If s^t stops growing before, the policy at s is uniform.
+
+Whatever the method, `Generalization.explain` says where a state's policy came from.
 """
 
-from collections.abc import Iterator
+import dataclasses
+import functools
+from collections.abc import Callable
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from jaxhom import checks
 from jaxhom.demonstrations import Demonstrations, empirical_policy
+from jaxhom.explainers import (
+    ByCoordinates,
+    ByHomomorphism,
+    ByHops,
+    demonstrated,
+    uniform_elsewhere,
+)
+from jaxhom.explanation import Explanation
 from jaxhom.homomorphism import ClassSimilarity
-from jaxhom.local_models import LocalModelClasses, local_model_classes, reachable_within, restricted_model
+from jaxhom.local_models import LocalModelClasses, local_model_classes
 from jaxhom.mdp import MDP
-from jaxhom.pdhg import engine
-from jaxhom.pdhg.global_homomorphism_lp import GlobalHomomorphismProblem
-
-_CHUNK_BYTES = 64 * 2**20
-_ITERATIONS_PER_REPORT = 320
+from jaxhom.votes import Votes, vote_of_nearest, vote_of_rings
 
 
-@chex.dataclass(frozen=True)
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["policy", "visited", "radius", "support", "error_lower", "error_upper"],
+    meta_fields=[],
+    drop_fields=["explainer"],
+)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Generalization:
     """A policy for every state, and where each state's came from.
 
@@ -39,6 +51,8 @@ class Generalization:
         found and the policy is uniform.
       support: int32 [S], how many demonstrated states voted; 1 on demonstrated states, 0 where nothing was found.
       error_lower, error_upper: scalars, bounds on the optimal error of the global program; None for other methods.
+      explainer: what the method remembers to explain itself, called with the generalization and a state. No part of
+        the pytree: whatever comes out of `jax.tree.map`, `jit` or `vmap` has forgotten it.
     """
 
     policy: jax.Array
@@ -47,6 +61,38 @@ class Generalization:
     support: jax.Array
     error_lower: jax.Array | None = None
     error_upper: jax.Array | None = None
+    explainer: Callable[["Generalization", int], Explanation] | None = None
+
+    def replace(self, **changes) -> "Generalization":
+        """Returns the generalization with the given fields exchanged."""
+        return dataclasses.replace(self, **changes)
+
+    def explain(self, state) -> Explanation:
+        """Says where a state's policy came from; `print` it, or read its arrays.
+
+        For Algorithm 1 that is which demonstrated states voted, at what radius, through which map from the state's
+        local model to theirs, and between which certified bounds the error of such a map lies; or that nothing was
+        found. Maps are computed on demand: the first call for models of a new size compiles for a few seconds.
+
+        Args:
+          state: its number.
+
+        Returns:
+          `Explanation`.
+
+        Raises:
+          ValueError: if there is no such state, or the generalization has gone through a JAX transformation and no
+            longer knows how it was made.
+        """
+        if self.explainer is None:
+            raise ValueError(
+                "this generalization no longer knows how it was made: jit, vmap and jax.tree.map drop that; "
+                "ask the one that the method returned"
+            )
+        number = checks.as_host_array("state", state)
+        checks.require_shape("state", number, "(), one state", number.ndim == 0)
+        number = int(checks.require_integers("state", number, upper=len(self.visited)))
+        return (demonstrated if self.visited[number] else self.explainer)(self, number)
 
 
 def soft_local_homomorphism(
@@ -101,7 +147,13 @@ def soft_local_homomorphism(
     def accept(state, expert):
         return similarity.decide(label[state], label[expert], mutual=mutual, progress=progress)
 
-    return _vote_of_rings(mdp, demonstrations, accept, states)
+    start = maximum_entropy(mdp, demonstrations)
+    if states is not None:
+        states = checks.as_host_array("states", states)
+        checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == (mdp.num_states,))
+        states = states.astype(bool)
+    explainer = ByHomomorphism(mdp, similarity, mutual, states)
+    return _extend(start, _vote_of_rings(mdp, start, accept, states), explainer)
 
 
 def class_similarity(
@@ -125,74 +177,6 @@ def class_similarity(
     if classes is None:
         classes = local_model_classes(mdp, distance=distance)
     return ClassSimilarity(mdp, classes, distance, anchored, tolerance, threshold)
-
-
-def soft_homomorphism(
-    mdp: MDP,
-    demonstrations: Demonstrations,
-    *,
-    anchored: bool = False,
-    tolerance: float = 1e-3,
-    max_iterations: int = 20_000,
-    progress: bool = False,
-) -> Generalization:
-    """The global soft homomorphism: one map from all states to the demonstrated ones, policies averaged by it.
-
-    Args:
-      mdp: the model.
-      demonstrations: the expert's trajectories, visiting E states.
-      anchored: map every demonstrated state to itself; False is the program as printed.
-      tolerance: gap between the bounds on the optimal error to settle for.
-      max_iterations: of PDHG; each costs a few products with [S, A, E] numbers.
-      progress: show a progress bar.
-
-    Returns:
-      `Generalization` with `error_lower` and `error_upper`. pi(s, .) = sum_s' f(s, s') pi(s', .) off the
-      demonstrated states; their `radius` is 1, and `support` counts the states with f(s, s') > 1e-3.
-
-    Raises:
-      ValueError: if a demonstration does not fit the model, or the tolerance is not positive.
-
-    Source: Boularias and Chaib-draa 2010, eq. (8). The paper gave it up for its size.
-    """
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be positive, got {tolerance}")
-    start = maximum_entropy(mdp, demonstrations)
-    experts = np.flatnonzero(np.asarray(start.visited))
-    pinned = np.zeros((mdp.num_states, len(experts)), bool)
-    if anchored:
-        pinned[experts, np.arange(len(experts))] = True
-    problem = GlobalHomomorphismProblem(
-        mdp=mdp, restricted=jnp.asarray(restricted_model(mdp, experts)), pinned=jnp.asarray(pinned)
-    )
-    state = _solve_with_progress(problem, tolerance, max_iterations, progress)
-    mapping = state.best_primal[..., 0]
-    voted = mapping @ start.policy[experts]
-    visited = start.visited
-    return start.replace(
-        policy=jnp.where(visited[:, None], start.policy, voted / voted.sum(axis=1, keepdims=True)),
-        radius=jnp.where(visited, 0, 1).astype(jnp.int32),
-        support=jnp.where(visited, 1, (mapping > 1e-3).sum(axis=1)).astype(jnp.int32),
-        error_lower=state.lower[0],
-        error_upper=state.upper[0],
-    )
-
-
-def _solve_with_progress(problem, tolerance: float, max_iterations: int, progress: bool) -> engine.PDHGState:
-    """Runs the engine a few hundred iterations at a time, so that the host can report and be interrupted."""
-    state = jax.jit(engine.init)(problem)
-    with tqdm(total=max_iterations, desc="homomorphism", unit="iteration", disable=not progress) as bar:
-        while int(state.steps[0]) < max_iterations and float(state.upper[0] - state.lower[0]) > tolerance:
-            limit = min(int(state.steps[0]) + _ITERATIONS_PER_REPORT, max_iterations)
-            state = _run_engine(problem, state, tolerance, limit)
-            bar.update(int(state.steps[0]) - bar.n)
-            bar.set_postfix(lower=f"{float(state.lower[0]):.4f}", upper=f"{float(state.upper[0]):.4f}")
-    return state
-
-
-@jax.jit
-def _run_engine(problem, state, tolerance, max_iterations) -> engine.PDHGState:
-    return engine.solve(problem, state, tolerance=tolerance, max_iterations=max_iterations)
 
 
 def nearest_neighbors(
@@ -221,7 +205,9 @@ def nearest_neighbors(
     Source: Boularias and Chaib-draa 2010, section VI (k-NN).
     """
     if metric == "hops":
-        return _vote_of_rings(mdp, demonstrations, lambda state, expert: np.ones(len(state), bool))
+        start = maximum_entropy(mdp, demonstrations)
+        votes = _vote_of_rings(mdp, start, lambda state, expert: np.ones(len(state), bool))
+        return _extend(start, votes, ByHops(mdp))
     if metric != "euclidean":
         raise ValueError(f'metric must be "hops" or "euclidean", got {metric!r}')
     if coordinates is None:
@@ -230,7 +216,9 @@ def nearest_neighbors(
     good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
     checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
     coordinates = checks.require_floats("coordinates", coordinates)
-    return _vote_of_nearest(mdp, demonstrations, coordinates)
+    start = maximum_entropy(mdp, demonstrations)
+    votes = vote_of_nearest(np.asarray(start.visited), np.asarray(start.policy), coordinates)
+    return _extend(start, votes, ByCoordinates(coordinates))
 
 
 def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
@@ -254,68 +242,16 @@ def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
         visited=visited,
         radius=jnp.where(visited, 0, -1).astype(jnp.int32),
         support=visited.astype(jnp.int32),
+        explainer=uniform_elsewhere,
     )
 
 
-def _vote_of_rings(mdp: MDP, demonstrations: Demonstrations, accept, states=None) -> Generalization:
-    """Grows s^t for every unvisited s until a demonstrated state in it is accepted; the accepted ones vote.
-
-    `accept(states, experts)` decides pairs [P] and is asked once about every pair that a ring brings together.
-    `states`, bool [S], are those that ask; all if None.
-    """
-    start = maximum_entropy(mdp, demonstrations)
-    visited, policy = np.asarray(start.visited), np.array(start.policy)
-    radius, support = np.array(start.radius), np.array(start.support)
-    asking = ~visited
-    if states is not None:
-        states = checks.as_host_array("states", states)
-        checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == visited.shape)
-        asking &= states.astype(bool)
-    experts, waiting = np.flatnonzero(visited), np.flatnonzero(asking)
-    for t, ring in enumerate(_rings(mdp, experts), start=1):
-        row, column = np.nonzero(ring[waiting])
-        accepted = accept(waiting[row], experts[column])
-        row, column = row[accepted], column[accepted]
-        votes = np.zeros((len(waiting), mdp.num_actions), policy.dtype)
-        np.add.at(votes, row, policy[experts[column]])
-        voters = np.bincount(row, minlength=len(waiting))
-        found = voters > 0
-        policy[waiting[found]] = votes[found] / votes[found].sum(axis=1, keepdims=True)
-        radius[waiting[found]], support[waiting[found]] = t, voters[found]
-        waiting = waiting[~found]
-        if not waiting.size:
-            break
-    return start.replace(policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support))
+def _vote_of_rings(mdp: MDP, start: Generalization, accept, states=None) -> Votes:
+    """The rings around the states that are neither demonstrated nor left out by `states`, bool [S]."""
+    visited = np.asarray(start.visited)
+    asking = ~visited if states is None else ~visited & states
+    return vote_of_rings(mdp, visited, np.asarray(start.policy), asking, accept)
 
 
-def _rings(mdp: MDP, experts: np.ndarray) -> Iterator[np.ndarray]:
-    """For t = 1, 2, ... until no set grows: bool [S, E], which demonstrated states joined s^t at step t."""
-    adjacency = reachable_within(mdp, 1)
-    within = np.zeros((mdp.num_states, len(experts)), bool)
-    within[experts, np.arange(len(experts))] = True
-    packed = np.packbits(within, axis=1)
-    while True:
-        # Row s of the union of its successors' rows; every row of `adjacency` holds s itself.
-        grown = np.bitwise_or.reduceat(packed[adjacency.indices], adjacency.indptr[:-1], axis=0)
-        joined = grown & ~packed
-        if not joined.any():
-            return
-        yield np.unpackbits(joined, axis=1, count=len(experts)).astype(bool)
-        packed = grown
-
-
-def _vote_of_nearest(mdp, demonstrations, coordinates) -> Generalization:
-    """Euclidean nearest demonstrated states, ties (to rounding) included."""
-    start = maximum_entropy(mdp, demonstrations)
-    visited, policy = np.asarray(start.visited), np.array(start.policy)
-    radius, support = np.array(start.radius), np.array(start.support)
-    experts, waiting = np.flatnonzero(visited), np.flatnonzero(~visited)
-    chunk = max(1, _CHUNK_BYTES // (8 * coordinates[experts].size))
-    for states in np.split(waiting, range(chunk, len(waiting), chunk)):
-        square = ((coordinates[states, None] - coordinates[experts]) ** 2).sum(axis=-1)
-        nearest = square.min(axis=1)
-        votes_for = square <= nearest[:, None] * (1 + 1e-9)
-        support[states] = votes_for.sum(axis=1)
-        policy[states] = votes_for @ policy[experts] / support[states, None]
-        radius[states] = np.maximum(np.ceil(np.sqrt(nearest) * (1 - 1e-9)), 1)
-    return start.replace(policy=jnp.asarray(policy), radius=jnp.asarray(radius), support=jnp.asarray(support))
+def _extend(start: Generalization, votes: Votes, explainer) -> Generalization:
+    return start.replace(**{name: jnp.asarray(array) for name, array in votes._asdict().items()}, explainer=explainer)

@@ -4,23 +4,20 @@ M^{s,d} is the model restricted to s^d, the states within d steps of s by any ac
 s^d becomes a self-loop on the state it leaves (Boularias and Chaib-draa 2010, section V). The centre s is state 0
 of its local model; the others follow in ascending order; padding has no transitions at all.
 
-Few local models are different: a 48 x 48 grid has nine at d = 1. `local_model_classes` finds them by colour
-refinement: every state of a local model gets a hash of its own colour and of the probabilities and colours of
-what it leads to and what leads to it, repeatedly; sorting by colour gives a canonical order, and two states are
-put into one class only if their models, brought into canonical order, are equal to the entry. A hash that
-collides or a tie that is broken badly can miss an isomorphism, which costs time, but never invent one.
+Few local models are different: a 48 x 48 grid has nine at d = 1. `local_model_classes` finds them by their canonical
+forms (see `canonical_forms`).
 """
 
 import chex
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
 
 from jaxhom import checks
+from jaxhom.canonical_forms import canonical_forms
 from jaxhom.mdp import MDP
 
 _CHUNK_BYTES = 64 * 2**20
-_MAX_ONE_BY_ONE = 32  # larger models have their ties broken all at once
-_SEED = np.uint64(0x9E3779B97F4A7C15)
 
 
 @chex.dataclass(frozen=True)
@@ -61,6 +58,11 @@ def reachable_within(mdp: MDP, steps: int) -> scipy.sparse.csr_array:
         reach = (reach @ adjacency).astype(bool)
     reach.sort_indices()
     return reach
+
+
+def steps_from(mdp: MDP, state: int) -> np.ndarray:
+    """Least number of steps by any actions from a state to every state, float [S]; infinite where none leads."""
+    return scipy.sparse.csgraph.dijkstra(_adjacency(mdp), indices=state, unweighted=True)
 
 
 def local_models(mdp: MDP, states, distance: int = 1) -> LocalModels:
@@ -129,7 +131,8 @@ def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelC
         for start in range(0, len(same_size), chunk):
             index = same_size[start : start + chunk]
             models = _restrict(host, states[index], rows[index], int(size))
-            for i, key in zip(index, _canonical_keys(models.transition, host.quantum_bits), strict=True):
+            keys, _ = canonical_forms(models.transition, host.quantum_bits)
+            for i, key in zip(index, keys, strict=True):
                 number = class_of_key.setdefault(key, len(class_of_key))
                 if number == len(first):
                     first.append(i)
@@ -145,6 +148,26 @@ def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelC
 def model_rounding(dtype) -> float:
     """Largest difference between two probabilities that `local_model_classes` takes as equal."""
     return 2.0 ** -_quantum_bits(dtype)
+
+
+def isomorphism(one: np.ndarray, other: np.ndarray) -> np.ndarray | None:
+    """The renaming that makes two local models equal: state i of `one` is state p[i] of `other`.
+
+    Args:
+      one: [n, A, n], centre first, no padding.
+      other: [m, A, m], likewise.
+
+    Returns:
+      int [n], or None where the canonical forms differ. Equal up to `model_rounding`, as within a class.
+    """
+    if one.shape != other.shape:
+        return None
+    (key, other_key), order = canonical_forms(np.stack([one, other]), _quantum_bits(one.dtype))
+    if key != other_key:
+        return None
+    renaming = np.empty(len(one), int)
+    renaming[order[0]] = order[1]
+    return renaming
 
 
 class _HostModel:
@@ -207,76 +230,3 @@ def _restrict(host: _HostModel, states, rows: scipy.sparse.csr_array, width: int
     flat = np.bincount((row * width + target).ravel(), weight.ravel(), minlength=np.prod(shape))
     transition = flat.reshape(shape).astype(host.probability.dtype)
     return LocalModels(members=members, size=sizes.astype(np.int32), transition=transition)
-
-
-def _canonical_keys(transition: np.ndarray, bits: int) -> list[bytes]:
-    """Bytes that are equal only if two models of the same size are equal up to renaming, [P, n, A, n] -> P."""
-    quanta = np.rint(transition.astype(np.float64) * 2.0**bits).astype(np.uint64)
-    count, size = quanta.shape[:2]
-    colour = np.broadcast_to(np.where(np.arange(size) == 0, 1, 2).astype(np.uint64), (count, size))
-    colour = _refine(quanta, colour)
-    active = np.arange(count)
-    while True:
-        tied = _tied(colour[active])
-        active = active[tied.any(axis=1)]
-        if not active.size:
-            break
-        colour[active] = _refine(quanta[active], _break_ties(colour[active], tied[tied.any(axis=1)]))
-    order = np.argsort(np.where(np.arange(size) == 0, np.uint64(0), colour), axis=1, kind="stable")
-    rows = np.take_along_axis(quanta, order[:, :, None, None], axis=1)
-    canonical = np.take_along_axis(rows, order[:, None, None, :], axis=3)
-    return [model.tobytes() for model in canonical]
-
-
-def _refine(quanta: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """Colour refinement to a stable partition; colours are [P, n] hashes that do not depend on the order.
-
-    A model stops when its own partition is stable: its colours must not depend on the models beside it.
-    """
-    action = np.arange(quanta.shape[2], dtype=np.uint64)[:, None]
-    present = quanta > 0
-    edge = _mix(quanta * np.uint64(31) + action)
-    colour, active = colour.copy(), np.arange(len(colour))
-    while active.size:
-        old = colour[active]
-        leads_to = np.where(present, _mix(edge + old[:, None, None, :]), np.uint64(0))
-        led_to_by = np.where(present, _mix(edge ^ _mix(old)[:, :, None, None]), np.uint64(0))
-        outgoing, incoming = leads_to.sum(axis=(2, 3)), led_to_by.sum(axis=(1, 2))
-        colour[active] = _mix(old + _mix(outgoing) + _mix(_mix(incoming)))
-        refines = _num_colours(colour[active]) != _num_colours(old)
-        active, edge, present = active[refines], edge[refines], present[refines]
-    return colour
-
-
-def _num_colours(colour: np.ndarray) -> np.ndarray:
-    """Number of different colours in each row."""
-    ordered = np.sort(colour, axis=1)
-    return 1 + (ordered[:, 1:] != ordered[:, :-1]).sum(axis=1)
-
-
-def _tied(colour: np.ndarray) -> np.ndarray:
-    """Marks, per row, the states whose colour another state has too."""
-    order = np.argsort(colour, axis=1, kind="stable")
-    ordered = np.take_along_axis(colour, order, axis=1)
-    equal = np.zeros((len(colour), colour.shape[1] + 1), bool)
-    equal[:, 1:-1] = ordered[:, 1:] == ordered[:, :-1]
-    tied = np.zeros(colour.shape, bool)
-    np.put_along_axis(tied, order, equal[:, 1:] | equal[:, :-1], axis=1)
-    return tied
-
-
-def _break_ties(colour: np.ndarray, tied: np.ndarray) -> np.ndarray:
-    """Gives one state of the smallest tied colour a colour of its own; all tied states if the model is large."""
-    rank = np.arange(colour.shape[1], dtype=np.uint64)
-    if colour.shape[1] > _MAX_ONE_BY_ONE:
-        return np.where(tied, _mix(colour + rank), colour)
-    chosen = np.argmin(np.where(tied, colour, np.iinfo(np.uint64).max), axis=1)[:, None]
-    return np.where(rank == chosen, _mix(colour + np.uint64(7)), colour)
-
-
-def _mix(value: np.ndarray) -> np.ndarray:
-    """The finaliser of splitmix64 (Steele, Lea and Flood 2014), modulo 2^64."""
-    value = value + _SEED
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))

@@ -20,6 +20,7 @@ import scipy.sparse
 
 from jaxhom import checks
 from jaxhom.demonstrations import Demonstrations, empirical_policy
+from jaxhom.explainers import ByOccupancy
 from jaxhom.generalization import Generalization
 from jaxhom.mdp import MDP
 from jaxhom.sparse_interior_point import Rows, flow_matrix, solve
@@ -62,6 +63,7 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
         visited=jnp.asarray(visited),
         radius=jnp.asarray(np.where(visited, 0, found), jnp.int32),
         support=jnp.asarray(np.where(visited, 1, visited.sum() * occurs), jnp.int32),
+        explainer=ByOccupancy(x),
     )
 
 

@@ -11,13 +11,13 @@ import pytest
 matplotlib = pytest.importorskip("matplotlib")
 matplotlib.use("Agg")
 
+import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib import collections  # noqa: E402
-from matplotlib.colors import to_rgba  # noqa: E402
 
 from jaxhom import plotting  # noqa: E402
 from jaxhom.demonstrations import Demonstrations  # noqa: E402
 from jaxhom.domains import gridworld, racetrack  # noqa: E402
-from jaxhom.plotting import plt  # noqa: E402
+from jaxhom.plotting import figures, pictures  # noqa: E402
 
 TRACK = ["XXXXXX", "S....F", "S..XXX", "XXXXXX"]
 CELLS, OPEN = 9, 8  # of which one is on the finish line
@@ -93,7 +93,6 @@ DRAW = {
     "policy": lambda domain, ax: plotting.plot_policy(domain, uniform(domain), ax=ax),
     "trajectories": lambda domain, ax: plotting.plot_trajectories(domain, sampled(domain), ax=ax),
     "occupancy": lambda domain, ax: plotting.plot_occupancy(domain, uniform(domain), ax=ax),
-    "radius": lambda domain, ax: plotting.plot_radius(domain, np.arange(domain.mdp.num_states) % 5 - 1, ax=ax),
 }
 
 
@@ -231,40 +230,6 @@ def test_occupancy_is_summed_over_speeds_and_actions(domain, ax):
     assert ax.images[-1].norm.vmax == shown.max()
 
 
-def test_radius_is_a_mosaic_of_speeds_with_two_colours_of_its_own(track, ax):
-    radius = np.full(CELLS * 25, 3)
-    radius[track.state_of((1, 2), (-2, 1))] = 0
-    radius[track.state_of((1, 2), (2, -2))] = -1
-    plotting.plot_radius(track, radius, ax=ax)
-    shown = heat(ax)
-    assert shown.shape == (5 * len(TRACK), 5 * len(TRACK[0]))
-    mosaic = np.full((5, 5), 3)
-    mosaic[0, 3], mosaic[4, 0] = 0, -1
-    np.testing.assert_array_equal(shown[5:10, 10:15], mosaic)
-    assert shown.count() == OPEN * 25
-    tones = ax.images[-1].to_rgba(np.array([-1, 0, 1, 2, 3]))
-    assert len(np.unique(tones, axis=0)) == 5
-    np.testing.assert_allclose(tones[:2], [to_rgba(plotting.PURPLE), to_rgba(plotting.VERMILLION)])
-    labels = [label.get_text() for label in ax.child_axes[0].get_yticklabels()]
-    assert labels == ["nothing found", "demonstrated", "1 step away", "2", "3"]
-
-
-def test_radius_of_demonstrated_states_alone(world, ax):
-    plotting.plot_radius(world, np.zeros(16, int), ax=ax)
-    assert set(heat(ax).ravel()) == {0}
-
-
-def test_certificate_shows_the_best_gap_so_far(ax):
-    lower, upper = np.array([0.0, 0.6, 0.5, 1.0]), np.array([2.0, 3.0, 1.0, 1.0])
-    assert plotting.plot_certificate(lower, upper, label="columns", ax=ax) is ax
-    best, own = (np.asarray(line.get_ydata()) for line in ax.lines)
-    np.testing.assert_allclose(best[:3], [2.0, 1.4, 0.4])
-    np.testing.assert_allclose(own[:3], [2.0, 2.4, 0.5])
-    assert 0 < best[3] < 1e-14
-    assert ax.get_yscale() == "log"
-    plotting.plot_certificate(lower, upper, iterations=[10, 20, 30, 40]).figure.canvas.draw()
-
-
 def test_the_figure_has_a_panel_per_policy_and_is_reproducible(world, track):
     figure = figure_of(world, track)
     titles = [ax.get_title(loc="left") for ax in figure.axes]
@@ -291,14 +256,14 @@ def test_off_roads_are_told_from_halts(track):
     ]
     for here, action, after, expected in steps:
         states = np.array([here, after])
-        (chance,) = plotting._off_road_chances(track, states, np.array([action]))
+        (chance,) = figures._off_road_chances(track, states, np.array([action]))
         np.testing.assert_allclose(chance, expected, atol=1e-12)
 
 
 def test_the_median_trial_is_in_the_middle(track):
-    trial = plotting._median_trial(jax.random.key(1), track, uniform(track), 6)
+    trial = figures._median_trial(jax.random.key(1), track, uniform(track), 6)
     assert trial.states.shape == (1, 7)
-    (states,) = plotting._unpadded(trial)
+    (states,) = pictures.unpadded(trial)
     assert not np.asarray(track.terminal)[states[:-1]].any()
 
 
@@ -357,17 +322,6 @@ MALFORMED = {
     "no occupancy": (
         lambda w, t: plotting.plot_occupancy(t, np.asarray(t.terminal)),
         "occupancy must be positive",
-    ),
-    "radius": (lambda w, t: plotting.plot_radius(t, np.ones(CELLS)), "radius must have shape"),
-    "radius of -2": (
-        lambda w, t: plotting.plot_radius(w, np.arange(GRID) - 2),
-        r"radius\[0\] must be whole and at least -1",
-    ),
-    "lower": (lambda w, t: plotting.plot_certificate(np.ones((2, 2)), np.ones(2)), "lower must"),
-    "upper": (lambda w, t: plotting.plot_certificate(np.ones(2), np.ones(3)), "upper must"),
-    "iterations": (
-        lambda w, t: plotting.plot_certificate(np.ones(2), np.ones(2), iterations=[1]),
-        "iterations must",
     ),
     "no policies": (
         lambda w, t: figure_of(w, t, racetrack_policies={}),

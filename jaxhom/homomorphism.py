@@ -54,13 +54,14 @@ def local_similarity(
 
     Args:
       mdp: the model.
-      sources, targets: int [P], the states s and s' of each pair. The error is not symmetric.
+      sources: int [P], the state s of each pair.
+      targets: int [P], its s'. The error is not symmetric.
       distance: d >= 1, the radius of the local models.
       anchored: require that the centre is mapped to the centre; False is the program as printed.
       tolerance: largest upper - lower to settle for.
       method: "pdhg"; "interior_point", for tight brackets of small models on a CPU (whatever it leaves open, PDHG
         finishes); or "auto", which chooses between them by the sizes and the tolerance.
-      max_iterations: per pair; a pair that needs more says so in `status` and keeps valid bounds.
+      max_iterations: per pair, 100,000 if not given; a pair that needs more says so in `status` and keeps valid bounds.
       progress: show a progress bar.
 
     Returns:
@@ -103,9 +104,11 @@ def locally_similar(
 
     Args:
       mdp: the model.
-      sources, targets: int [P], the states s and s' of each pair.
+      sources: int [P], the state s of each pair.
+      targets: int [P], its s'.
       threshold: epsilon >= 0.
-      distance, anchored: as in `local_similarity`.
+      distance: d >= 1, as in `local_similarity`.
+      anchored: as in `local_similarity`.
       mutual: require the error of both directions to be within the threshold.
       tolerance: width of the band.
       progress: show a progress bar.

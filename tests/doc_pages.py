@@ -70,9 +70,14 @@ def steps_of(page: str) -> list[Step]:
     return steps
 
 
+def prose_of(page: str) -> str:
+    """A page without its blocks."""
+    return _BLOCK.sub("", page)
+
+
 def pictures_of(page: str) -> list[str]:
     """Paths of the pictures that a page shows, relative to it."""
-    return _PICTURE.findall(page)
+    return _PICTURE.findall(prose_of(page))
 
 
 def run_step(step: Step, namespace: dict, path: pathlib.Path) -> str:

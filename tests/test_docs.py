@@ -6,7 +6,7 @@ import struct
 
 import matplotlib
 import pytest
-from doc_pages import DOCS, PAGES, README, ROOT, blocks_of, differences, pictures_of, run_step, steps_of
+from doc_pages import DOCS, PAGES, README, ROOT, blocks_of, differences, pictures_of, prose_of, run_step, steps_of
 
 import jaxhom
 from jaxhom import interop, plotting
@@ -63,7 +63,7 @@ def test_blocks_have_a_known_kind(path):
 
 @pytest.mark.parametrize("path", PAGES, ids=NAMES)
 def test_links_and_pictures_lead_somewhere(path):
-    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text()):
+    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", prose_of(path.read_text())):
         if "://" not in target:
             assert (path.parent / target).exists(), target
 

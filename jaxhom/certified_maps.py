@@ -11,7 +11,7 @@ import numpy as np
 from jaxhom.lane_queue import solve_many
 from jaxhom.local_models import isomorphism, local_models, model_rounding
 from jaxhom.mdp import MDP
-from jaxhom.pdhg import SOLVER, PDHGState, Status, engine
+from jaxhom.pdhg import Status, engine
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem, plain_forward
 
 _LANES = 8
@@ -86,7 +86,7 @@ def _solve(from_models, to_models, pairs: np.ndarray, anchored: bool, result: Ce
     tolerance = 1e-6 if source.dtype == np.float64 else 1e-4
     per_iteration = 2 * source.shape[1] * len(source) * len(target) * (len(source) + len(target))
     found = solve_many(
-        SOLVER,
+        engine.SOLVER,
         HomomorphismProblem(
             source=source,
             target=target,
@@ -97,11 +97,12 @@ def _solve(from_models, to_models, pairs: np.ndarray, anchored: bool, result: Ce
         tolerance=tolerance,
         max_iterations=int(np.clip(_MAX_PRODUCTS / per_iteration, engine.STEPS_PER_CHECK, _MAX_ITERATIONS)),
         lanes=_LANES,
+        keep=("lower", "upper", "best_primal"),
     )
-    state = PDHGState(**found)
-    result.lower[pairs], result.upper[pairs] = np.maximum(state.lower, 0.0), state.upper
-    result.maps[pairs] = np.moveaxis(state.best_primal, -1, 0)[:, :n, :m]
-    result.status[pairs] = np.where(engine.is_settled(state, tolerance), Status.SOLVED, Status.ITERATION_LIMIT)
+    result.lower[pairs], result.upper[pairs] = np.maximum(found["lower"], 0.0), found["upper"]
+    result.maps[pairs] = np.moveaxis(found["best_primal"], -1, 0)[:, :n, :m]
+    is_settled = found["upper"] - found["lower"] <= tolerance
+    result.status[pairs] = np.where(is_settled, Status.SOLVED, Status.ITERATION_LIMIT)
 
 
 def _padded(models, pairs: np.ndarray) -> np.ndarray:

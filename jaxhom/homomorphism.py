@@ -186,7 +186,7 @@ class ClassSimilarity:
         iterations, status = np.zeros((2, count), np.int32)
         groups = self._paddings(pairs)
         self.num_solved += int((groups[:, 0] >= 0).sum())
-        with tqdm(total=count, desc="similarity", unit="pair", disable=not progress) as bar:
+        with tqdm(total=count, desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
             bar.update(int((groups[:, 0] < 0).sum()))
             for group in np.unique(groups[groups[:, 0] >= 0], axis=0):
                 (members,) = np.nonzero((groups == group).all(axis=1))

@@ -14,6 +14,7 @@ states of the environment stay as they are. That is right for every table.
 """
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -113,7 +114,9 @@ def make_environment(name: str, **options):
             f"making {name!r} needs gymnasium, which is not installed: pip install 'jaxhom[interop]'"
         ) from error
     try:
-        return gymnasium.make(name, **options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # the version is the caller's choice
+            return gymnasium.make(name, **options)
     except gymnasium.error.Error as error:
         reason = str(error).partition("\n")[0]
     except Exception as error:  # constructors raise what they come upon

@@ -89,8 +89,8 @@ class Board:
 def board_of(domain, kind=(Gridworld, Racetrack, TileMap)) -> Board:
     if not isinstance(domain, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        names = " or a ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"the domain must be a {names}, got {type(domain).__name__}")
+        names = " or ".join(f"a {kind.__name__}" for kind in kinds)
+        raise ValueError(f"the domain must be {names}, got {type(domain).__name__}")
     if isinstance(domain, TileMap):
         shape = (len(domain.rows), len(domain.rows[0]))
         is_open = np.array([letter in ".S" for row in domain.rows for letter in row])

@@ -16,6 +16,7 @@ from jaxhom.plotting.palette import AMOUNT, BLUE, PURPLE, VERMILLION
 from jaxhom.plotting.pictures import unpadded
 
 _DECADES = 4  # of an occupancy that are told apart
+_NAMES = ("\N{MULTIPLICATION SIGN} nothing found", "\N{BULLET} demonstrated")
 
 
 def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axes:
@@ -122,10 +123,11 @@ def plot_radius_counts(radius, *, ax: Axes | None = None) -> Axes:
     levels = np.arange(-1, max(int(radius.max()), 1) + 1)
     counts = [(radius == level).sum() for level in levels]
     ax = _axes(ax, height=2.8)
-    ax.bar(levels, counts, color=[PURPLE, VERMILLION, *[BLUE] * (len(levels) - 2)])
-    every = -(-len(levels) // 20)
-    steps = levels[2::every]
-    ax.set_xticks([-1, 0, *steps], labels=["nothing\nfound", "demon-\nstrated", *map(str, steps)])
+    colors = [PURPLE, VERMILLION, *[BLUE] * (len(levels) - 2)]
+    bars = ax.bar(levels, counts, color=colors)
+    ax.legend(bars[:3], [*_NAMES, "generalized to"], frameon=False, loc="best")
+    steps = levels[2 :: -(-len(levels) // 20)]
+    ax.set_xticks([-1, 0, *steps], labels=[*(name[0] for name in _NAMES), *map(str, steps)])
     ax.set(xlabel="steps to the demonstrated states that voted", ylabel="states")
     ax.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     return _plain(ax)

@@ -6,7 +6,7 @@ tutorial builds on what it made before. What a block is:
     python    runs
     bash      lines that begin with `python -m jaxhom` run, in this process: starting Python and JAX anew costs
               seconds. Lines that install run elsewhere (`.ci/run`); their extras have to exist
-    text      what the block before it printed
+    text      what the block before it printed; commands may leave it out, Python may not
     (none)    formulas, and tables that other programs print
 
 `python tests/doc_pages.py` writes what the blocks print, and their pictures, into the pages.

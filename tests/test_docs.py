@@ -33,6 +33,8 @@ def test_a_page_prints_what_it_says_and_draws_its_pictures(path, tmp_path, monke
     for step in steps_of(page):
         printed = run_step(step, namespace, path)
         where = f"{path.name} line {step.block.line}"
+        if step.output is None and step.block.language == "bash":
+            continue  # that a command runs is enough
         expected = "" if step.output is None else step.output.text
         found = differences(printed, expected)
         assert found is None, f"{where}: {found}; printed\n{printed}\nfor\n{expected}"

@@ -21,7 +21,7 @@ from jaxhom.occupancy import feature_expectations
 
 _EXAMPLES = """\
 examples:
-  python -m jaxhom learn --env FrozenLake-v1 is_slippery=false --expert 2 --output lake
+  python -m jaxhom learn --env FrozenLake-v1 map_name=8x8 --expert 2 --output lake
   python -m jaxhom learn --mdp a --expert 2 --lpal --output track
   python -m jaxhom learn --mdp my.track --demonstrations drives.csv --output track
   python -m jaxhom learn --mdp model.npz --demonstrations demos.npz --output policy.npz
@@ -78,16 +78,16 @@ def run(options) -> None:
     """
     problem = _with_features(load_problem(options), options)
     check_method(problem, options)
+    demonstrations, origin = load_trajectories(problem, options)
     output = Results(options.output)
     try:
-        _learn(problem, options, output)
+        _learn(problem, demonstrations, origin, options, output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("written so far: " + (", ".join(output.written) or "nothing")) from None
     print("\nWritten: " + ", ".join(output.written))
 
 
-def _learn(problem: Problem, options, output: Results) -> None:
-    demonstrations, origin = load_trajectories(problem, options)
+def _learn(problem: Problem, demonstrations, origin: str, options, output: Results) -> None:
     output.demonstrations(demonstrations)
     visited, _ = empirical_policy(problem.mdp, demonstrations)
     report = Report(problem, demonstrations, origin, visited, options, output)
@@ -118,18 +118,24 @@ def _wants_lpal(options) -> bool:
 
 
 def _with_features(problem: Problem, options) -> Problem:
-    """The problem, with features if LPAL needs some and `--features` asks for them."""
-    if options.features and problem.mdp.num_features:
-        raise ValueError(f"--features: {problem.name} has features of its own")
-    if options.features:
-        eye = jnp.eye(problem.mdp.num_states, dtype=problem.mdp.dtype)
-        features = jnp.broadcast_to(eye[:, None], (len(eye), problem.mdp.num_actions, len(eye)))
-        return dataclasses.replace(problem, mdp=problem.mdp.replace(features=features))
-    if _wants_lpal(options) and not problem.mdp.num_features:
-        raise ValueError(f"{problem.name}: LPAL needs features, and the model has none; --features states makes some")
+    """The problem, with features if LPAL needs some and `--features` asks for them; checks LPAL's options."""
+    if not _wants_lpal(options):
+        for name in ("lpal_tolerance", "features"):
+            if getattr(options, name) is not None:
+                raise ValueError(f"--{name.replace('_', '-')} belongs to --lpal and to --method monte-carlo")
+        return problem
     if options.lpal_tolerance is not None and not options.lpal_tolerance > 0.0:
         raise ValueError(f"--lpal-tolerance must be positive, got {options.lpal_tolerance}")
-    return problem
+    mdp = problem.mdp
+    if not options.features:
+        if not mdp.num_features:
+            raise ValueError(f"{problem.name}: LPAL needs features, and the model has none; try --features states")
+        return problem
+    if mdp.num_features:
+        raise ValueError(f"--features: {problem.name} has features of its own")
+    eye = jnp.eye(mdp.num_states, dtype=mdp.dtype)
+    features = jnp.broadcast_to(eye[:, None], (mdp.num_states, mdp.num_actions, mdp.num_states))
+    return dataclasses.replace(problem, mdp=mdp.replace(features=features))
 
 
 def _apprentice(problem: Problem, demonstrations, policy, options):

@@ -3,6 +3,8 @@
 matplotlib is imported by the functions alone: every other command works without it.
 """
 
+import importlib
+
 from jaxhom.cli.sources import Problem
 from jaxhom.domains import Racetrack
 from jaxhom.occupancy import occupancy
@@ -16,11 +18,8 @@ def load_plotting():
     Raises:
       ImportError: if matplotlib is missing, saying how to install it.
     """
-    import matplotlib
-
-    from jaxhom import plotting
-
-    matplotlib.use("Agg")
+    plotting = importlib.import_module("jaxhom.plotting")
+    importlib.import_module("matplotlib").use("Agg")
     return plotting
 
 

@@ -2,6 +2,7 @@
 
 import types
 
+from jaxhom import checks
 from jaxhom.cli import pictures
 from jaxhom.cli.options import MODEL_HELP, Parser, add_command, add_model_options
 from jaxhom.cli.results import save_figure
@@ -66,6 +67,8 @@ def _figure(problem: Problem, options):
     known = load_arrays(path, "visited", "radius", "support")
     speed = tuple(options.speed) if options.speed else None
     try:
+        for name, array in known.items():
+            checks.require_shape(name, array, f"({len(policy)},)", array.shape == (len(policy),))
         if options.kind == "policy":
             return pictures.draw_policy(problem, policy, known.get("visited"), speed or (0, 0))
         for name in ("visited", "radius", "support"):

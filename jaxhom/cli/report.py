@@ -37,6 +37,7 @@ class Report:
         count, num_visited = demonstrations.num_trajectories, int(np.asarray(visited).sum())
         self.content = {
             "finished": False,
+            "options": {name: value for name, value in vars(options).items() if name not in ("run", "command")},
             "model": {"name": problem.name, **sizes, "discount": float(mdp.discount)},
             "demonstrations": {"origin": origin, "trajectories": count, "steps": steps, "states": num_visited},
             "method": {"name": options.method, **settings_of(options)},

@@ -6,9 +6,9 @@
                     probability       [S, A, N], rows sum to 1                        two
                     initial           [S], optional: uniform if missing
                     features          [S, A, K] or [S, K], optional
-                    reward            [S, A] or [S], optional                         for the
-                    coordinates       [S, D], optional: positions of the states       command
-                    terminal          bool [S], optional: where episodes end          line
+    beside a model  reward            [S, A] or [S]                                   all optional,
+                    coordinates       [S, D], positions of the states                 read by the
+                    terminal          bool [S], where episodes end                    command line
     demonstrations  states, actions   integers [M, H] (or [H] for one trajectory)
                     length            integers [M], optional: steps of each trajectory; H if missing
     policy          policy            [S, A], rows sum to 1

@@ -24,6 +24,7 @@ from jaxhom.plotting.palette import AMOUNT, FAINT, INK, ROAD, START, WALL
 
 BAR_ROOM, LEVEL_ROOM = 1.2, 2.0  # inches beside the map, for a colour bar with numbers and one with names
 
+_LEAST_HEIGHT = 2.6  # inches, beside which the label of a colour bar finds room
 _CHECKER = 4  # chequers along the side of a finish cell
 _LEAST_PROBABILITY = 0.02  # of an action that gets an arrow
 
@@ -122,7 +123,7 @@ def ground(board: Board, ax: Axes | None, room: float = 0.0) -> Axes:
     rows, columns = board.shape
     if ax is None:
         scale = min(9.0 / columns, 5.5 / rows, 0.6)
-        size = (columns * scale + 0.8 + room, rows * scale + 0.8)
+        size = (columns * scale + 0.8 + room, max(rows * scale + 0.8, _LEAST_HEIGHT if room else 0.0))
         _, ax = plt.subplots(figsize=size, layout="constrained")
     if isinstance(board.domain, Gridworld):
         borders = borders_of(board, np.asarray(board.domain.region))

@@ -2,7 +2,15 @@
 
 import sys
 
-from jaxhom.cli import main
+
+def _run() -> int:
+    try:
+        from jaxhom.cli import main
+
+        return main()
+    except KeyboardInterrupt:  # while the libraries are loading
+        return 130
+
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(_run())

@@ -32,7 +32,8 @@ class LocalSimilarity:
     """Certified brackets of the optimal errors of P pairs.
 
     Attributes:
-      lower, upper: [P], lower <= e <= upper, rounding included.
+      lower: [P], lower <= e <= upper for the optimal error e, rounding included.
+      upper: [P], likewise.
       iterations: int32 [P], iterations of the method that settled the pair; 0 where the local models are isomorphic.
       status: int32 [P], a `jaxhom.Status`.
     """

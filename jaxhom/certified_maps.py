@@ -25,7 +25,8 @@ class CertifiedMaps:
     """Maps from the local models of P source states to those of P target states, NumPy.
 
     Attributes:
-      lower, upper: [P], lower <= e <= upper for the optimal error e of LP (9), rounding included.
+      lower: [P], lower <= e <= upper for the optimal error e of LP (9), rounding included.
+      upper: [P], likewise.
       maps: [P, n, m], rows sum to 1: f(i, k) is the share of the source's i-th state that goes to the target's k-th.
         Its own error |K f|_inf is at most `upper`. Zero on padding.
       sources: int [P, n], the states of M^{s,d} that the rows stand for, centre first; -1 on padding.

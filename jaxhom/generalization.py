@@ -50,7 +50,9 @@ class Generalization:
       radius: int32 [S], how far the method had to look (steps); 0 on demonstrated states, -1 where nothing was
         found and the policy is uniform.
       support: int32 [S], how many demonstrated states voted; 1 on demonstrated states, 0 where nothing was found.
-      error_lower, error_upper: scalars, bounds on the optimal error of the global program; None for other methods.
+      error_lower: scalar, error_lower <= e <= error_upper for the optimal error e of the global program; None for other
+        methods.
+      error_upper: scalar, likewise.
       explainer: what the method remembers to explain itself, called with the generalization and a state. No part of
         the pytree: whatever comes out of `jax.tree.map`, `jit` or `vmap` has forgotten it.
     """
@@ -168,7 +170,10 @@ def class_similarity(
 
     Args:
       mdp: the model.
-      distance, threshold, anchored, tolerance: as there.
+      distance: as there.
+      threshold: as there.
+      anchored: as there.
+      tolerance: as there.
       classes: of all states at that distance, if they are known.
 
     Returns:

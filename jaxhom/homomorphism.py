@@ -55,13 +55,14 @@ def local_similarity(
 
     Args:
       mdp: the model.
-      sources, targets: int [P], the states s and s' of each pair. The error is not symmetric.
+      sources: int [P], the state s of each pair.
+      targets: int [P], its s'. The error is not symmetric.
       distance: d >= 1, the radius of the local models.
       anchored: require that the centre is mapped to the centre; False is the program as printed.
       tolerance: largest upper - lower to settle for.
       method: "pdhg"; "interior_point", for tight brackets of small models on a CPU (whatever it leaves open, PDHG
         finishes); or "auto", which chooses between them by the sizes and the tolerance.
-      max_iterations: per pair; a pair that needs more says so in `status` and keeps valid bounds.
+      max_iterations: per pair, 100,000 if not given; a pair that needs more says so in `status` and keeps valid bounds.
       progress: show a progress bar.
 
     Returns:
@@ -104,9 +105,11 @@ def locally_similar(
 
     Args:
       mdp: the model.
-      sources, targets: int [P], the states s and s' of each pair.
+      sources: int [P], the state s of each pair.
+      targets: int [P], its s'.
       threshold: epsilon >= 0.
-      distance, anchored: as in `local_similarity`.
+      distance: d >= 1, as in `local_similarity`.
+      anchored: as in `local_similarity`.
       mutual: require the error of both directions to be within the threshold.
       tolerance: width of the band.
       progress: show a progress bar.
@@ -184,7 +187,7 @@ class ClassSimilarity:
         iterations, status = np.zeros((2, count), np.int32)
         groups = self._paddings(pairs)
         self.num_solved += int((groups[:, 0] >= 0).sum())
-        with tqdm(total=count, desc="similarity", unit="pair", disable=not progress) as bar:
+        with tqdm(total=count, desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
             bar.update(int((groups[:, 0] < 0).sum()))
             for group in np.unique(groups[groups[:, 0] >= 0], axis=0):
                 (members,) = np.nonzero((groups == group).all(axis=1))

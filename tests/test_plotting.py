@@ -275,7 +275,7 @@ MALFORMED = {
     "racetrack, grid": (lambda w, t: plotting.plot_racetrack(w), "must be a Racetrack, got Gridw"),
     "policy, model": (
         lambda w, t: plotting.plot_policy(w.mdp, uniform(w)),
-        "must be a Gridworld or a Racetrack, got MDP",
+        "must be a Gridworld or a Racetrack or a TileMap, got MDP",
     ),
     "gridworld values": (
         lambda w, t: plotting.plot_gridworld(w, values=np.ones((4, 4))),

@@ -1,96 +1,167 @@
-"""`python -m jaxhom learn`: a policy for a user's own model and demonstrations."""
+"""`python -m jaxhom learn`: a policy for every state of a model, from demonstrations.
+
+Stages follow each other, and each writes what it found before the next begins: demonstrations, the generalized
+policy, LPAL's, pictures. An interruption loses the stage that is under way and nothing else.
+"""
+
+import dataclasses
 
 import jax.numpy as jnp
-import numpy as np
 
-from jaxhom.cli.tables import format_table
+from jaxhom.cli import pictures, results
+from jaxhom.cli.methods import METHODS, check_method, generalize, wants_progress
+from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_method_options, add_model_options
+from jaxhom.cli.report import Report
+from jaxhom.cli.results import Results
+from jaxhom.cli.sources import Problem, load_problem, load_trajectories
 from jaxhom.demonstrations import empirical_policy, monte_carlo_feature_expectations
-from jaxhom.generalization import (
-    Generalization,
-    maximum_entropy,
-    nearest_neighbors,
-    soft_local_homomorphism,
-)
-from jaxhom.interop.files import FileError, load_demonstrations, load_mdp, save_policy
+from jaxhom.interop import files
 from jaxhom.lpal import lpal
 from jaxhom.occupancy import feature_expectations
-from jaxhom.pdhg import Status
 
-METHODS = ("soft-local-homomorphism", "nearest-neighbors", "maximum-entropy", "monte-carlo")
+_EXAMPLES = """\
+examples:
+  python -m jaxhom learn --env FrozenLake-v1 map_name=8x8 --expert 2 --output lake
+  python -m jaxhom learn --mdp a --expert 2 --lpal --output track
+  python -m jaxhom learn --mdp my.track --demonstrations drives.csv --output track
+  python -m jaxhom learn --mdp model.npz --demonstrations demos.npz --output policy.npz
+
+"""
+_OUTPUT = """\
+--output is a folder, or the name of an .npz file for the policy alone:
+{}
+
+demonstrations in .csv files: one step a line, the first line names the columns episode, state, action
+
+.npz files are NumPy archives (numpy.savez) of plain arrays:
+
+{}"""
+_LPAL_METHODS = ("columns", "interior_point", "flow")
+
+
+def add_parser(commands) -> None:
+    """Adds the command."""
+    formats = files.__doc__.partition("\n\n")[2].partition("\n\nAnything")[0]
+    layout = results.__doc__.partition("\n\n")[2].rstrip()
+    epilog = _EXAMPLES + MODEL_HELP + "\n" + _OUTPUT.format(layout, formats)
+    summary = "learn a policy for every state of a model from demonstrations"
+    parser = add_command(commands, "learn", run, summary=summary, epilog=epilog)
+    add_model_options(parser)
+    add_demonstration_options(parser)
+    add_method_options(parser)
+    group = parser.add_argument_group("apprenticeship learning")
+    group.add_argument(
+        "--lpal",
+        nargs="?",
+        const=_LPAL_METHODS[0],
+        choices=_LPAL_METHODS,
+        metavar="SOLVER",
+        help="feed the policy's feature expectations to LPAL; solved by columns (default), interior_point or flow",
+    )
+    group.add_argument(
+        "--lpal-tolerance", type=float, metavar="T", help="largest certified gap of the margin to settle for"
+    )
+    group.add_argument(
+        "--features", choices=("states",), help="for models without features: an indicator of every state"
+    )
+    group = parser.add_argument_group("results")
+    group.add_argument("--output", required=True, metavar="PATH", help="folder (see below), or policy .npz")
+    group.add_argument("--no-pictures", action="store_true", help="write none")
 
 
 def run(options) -> None:
-    """Reads, learns, prints a summary and writes the policy; raises `FileError` or `ValueError` on bad input."""
-    mdp = load_mdp(options.mdp)
-    demonstrations = load_demonstrations(options.demonstrations)
+    """Reads, learns, prints and writes.
+
+    Raises:
+      ValueError: on wrong input, before anything is computed.
+      KeyboardInterrupt: with the files that were written as its message.
+    """
+    problem = _with_features(load_problem(options), options)
+    check_method(problem, options)
+    demonstrations, origin = load_trajectories(problem, options)
+    output = Results(options.output)
     try:
-        demonstrations.validate(mdp)
-    except ValueError as error:
-        raise FileError(f"{options.demonstrations}: {error}") from None
-    wants_lpal = options.lpal or options.method == "monte-carlo"
-    if wants_lpal and not mdp.num_features:
-        raise FileError(f"{options.mdp}: LPAL needs features, and the model has none")
-    if wants_lpal:
-        expectations, generalization = _expectations(mdp, demonstrations, options)
-        initial = None if generalization is None else generalization.policy
-        solution = lpal(mdp, expectations, initial_policy=initial, progress=True)
-        policy = solution.policy
-        certificate = {"margin": solution.margin, "margin_bound": solution.margin_bound}
+        _learn(problem, demonstrations, origin, options, output)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("written so far: " + (", ".join(output.written) or "nothing")) from None
+    print("\nWritten: " + ", ".join(output.written))
+
+
+def _learn(problem: Problem, demonstrations, origin: str, options, output: Results) -> None:
+    output.demonstrations(demonstrations)
+    visited, _ = empirical_policy(problem.mdp, demonstrations)
+    report = Report(problem, demonstrations, origin, visited, options, output)
+    title, general, policy, known, policies = METHODS[options.method].title, None, None, {"visited": visited}, {}
+    if METHODS[options.method].function:
+        with report.timed("seconds_generalizing"):
+            general, numbers = generalize(problem, demonstrations, options)
+        policy = policies[title] = general.policy
+        known |= {"radius": general.radius, "support": general.support, **numbers}
+        output.policy(policy, is_final=not _wants_lpal(options), **known)
+        report.generalization(general, numbers)
+    if _wants_lpal(options):
+        with report.timed("seconds_lpal"):
+            solution = _apprentice(problem, demonstrations, policy, options)
+        policy = policies[f"{title} + LPAL"] = solution.policy
+        known |= {"margin": solution.margin, "margin_bound": solution.margin_bound}
+        output.policy(policy, is_final=True, **known)
+        report.lpal(solution)
+    if problem.reward is not None:
+        report.values({"optimal": problem.plan.policy, **policies})
+    if output.is_folder and not options.no_pictures:
+        _draw(problem, demonstrations, general, policy, visited, output)
+    report.finish()
+
+
+def _wants_lpal(options) -> bool:
+    return options.lpal is not None or METHODS[options.method].function is None
+
+
+def _with_features(problem: Problem, options) -> Problem:
+    """The problem, with features if LPAL needs some and `--features` asks for them; checks LPAL's options."""
+    if not _wants_lpal(options):
+        for name in ("lpal_tolerance", "features"):
+            if getattr(options, name) is not None:
+                raise ValueError(f"--{name.replace('_', '-')} belongs to --lpal and to --method monte-carlo")
+        return problem
+    if options.lpal_tolerance is not None and not options.lpal_tolerance > 0.0:
+        raise ValueError(f"--lpal-tolerance must be positive, got {options.lpal_tolerance}")
+    mdp = problem.mdp
+    if not options.features:
+        if not mdp.num_features:
+            raise ValueError(f"{problem.name}: LPAL needs features, and the model has none; try --features states")
+        return problem
+    if mdp.num_features:
+        raise ValueError(f"--features: {problem.name} has features of its own")
+    eye = jnp.eye(mdp.num_states, dtype=mdp.dtype)
+    features = jnp.broadcast_to(eye[:, None], (mdp.num_states, mdp.num_actions, mdp.num_states))
+    return dataclasses.replace(problem, mdp=mdp.replace(features=features))
+
+
+def _apprentice(problem: Problem, demonstrations, policy, options):
+    """LPAL's solution, for the expectations of the generalized policy or those of the demonstrations alone."""
+    if policy is None:
+        expectations = monte_carlo_feature_expectations(problem.mdp, demonstrations)
     else:
-        generalization, solution = _generalize(mdp, demonstrations, options), None
-        policy, certificate = generalization.policy, {}
-    extras = {} if generalization is None else {"radius": generalization.radius, "support": generalization.support}
-    visited, _ = empirical_policy(mdp, demonstrations)
-    save_policy(options.output, policy, visited=visited, **extras, **certificate)
-    print(_summary(mdp, demonstrations, visited, generalization, solution))
-    print(f"\nPolicy written to {options.output}")
-
-
-def _generalize(mdp, demonstrations, options) -> Generalization:
-    if options.method == "nearest-neighbors":
-        return nearest_neighbors(mdp, demonstrations)
-    if options.method == "maximum-entropy":
-        return maximum_entropy(mdp, demonstrations)
-    return soft_local_homomorphism(
-        mdp,
-        demonstrations,
-        distance=options.distance,
-        threshold=options.threshold,
-        anchored=not options.printed,
-        mutual=options.mutual,
-        progress=True,
+        expectations = feature_expectations(problem.mdp, policy)
+    return lpal(
+        problem.mdp,
+        expectations,
+        initial_policy=policy,
+        tolerance=options.lpal_tolerance,
+        method=options.lpal or _LPAL_METHODS[0],
+        progress=wants_progress(options),
     )
 
 
-def _expectations(mdp, demonstrations, options):
-    """What LPAL is to match, and the generalization it came from, if any."""
-    if options.method == "monte-carlo":
-        return monte_carlo_feature_expectations(mdp, demonstrations), None
-    generalization = _generalize(mdp, demonstrations, options)
-    return feature_expectations(mdp, generalization.policy), generalization
-
-
-def _summary(mdp, demonstrations, visited, generalization, solution) -> str:
-    rows = [
-        ("states, actions, features", f"{mdp.num_states}, {mdp.num_actions}, {mdp.num_features}"),
-        ("demonstrations", f"{demonstrations.num_trajectories}"),
-        ("steps in them", f"{int(np.asarray(demonstrations.mask).sum())}"),
-        ("states demonstrated", _share(visited)),
-    ]
-    if generalization is not None:
-        radius = np.asarray(generalization.radius)
-        rows.append(("states generalized to", _share(radius > 0)))
-        rows.append(("states without a vote (uniform policy)", _share(radius < 0)))
-        if (radius > 0).any():
-            found = radius[radius > 0]
-            rows.append(("steps to the voters, median and largest", f"{int(np.median(found))}, {found.max()}"))
-    if solution is not None:
-        rows.append(("LPAL margin", f"{float(solution.margin):.6g}"))
-        rows.append(("no policy's margin exceeds", f"{float(solution.margin_bound):.6g}"))
-        rows.append(("LPAL status", Status(int(solution.status)).message))
-    return format_table(("quantity", "value"), rows)
-
-
-def _share(mask) -> str:
-    mask = jnp.asarray(mask)
-    return f"{int(mask.sum())} ({100 * float(mask.mean()):.1f}%)"
+def _draw(problem: Problem, demonstrations, general, policy, visited, output: Results) -> None:
+    try:
+        pictures.load_plotting()
+    except ImportError as error:
+        print(f"\nNo pictures: {error}")
+        return
+    output.picture("trajectories", pictures.draw_trajectories(problem, demonstrations))
+    if general is not None:
+        output.picture("generalization", pictures.draw_generalization(problem, general))
+    output.picture("policy", pictures.draw_policy(problem, policy, visited))
+    output.picture("occupancy", pictures.draw_occupancy(problem, policy))

@@ -10,6 +10,7 @@ demonstrations' length (Boularias and Chaib-draa 2010, section VI). What is cert
 """
 
 import dataclasses
+import sys
 from collections.abc import Callable, Iterator
 
 import jax
@@ -17,7 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom.cli.tables import format_table
+from jaxhom.cli.methods import wants_progress
+from jaxhom.cli.options import Parser, count, positive
+from jaxhom.cli.pictures import load_plotting
+from jaxhom.cli.results import save_figure
+from jaxhom.cli.tables import GrowingTable
 from jaxhom.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.domains import Gridworld, Racetrack, gridworld, racetrack, sample_weights
 from jaxhom.evaluation import evaluate_exactly
@@ -32,6 +37,8 @@ GENERALIZATIONS: dict[str, Callable] = {
     "k-NN (hops)": nearest_neighbors,
     "maximum entropy": maximum_entropy,
 }
+EXPERT = "expert"
+METHODS = (EXPERT, *GENERALIZATIONS, "soft local homomorphism + LPAL")
 _GRID_TRIAL = 50
 _TRACK_DEMONSTRATION = 20
 _TRACK_TRIAL = 30
@@ -73,7 +80,6 @@ HEADER = ("method", "reward/step", "% of expert", "steps", "off-roads/step", "lo
 class _Setting:
     """One block of the table: a model, the true rewards [B, S, A] and the expert's plans of its B sets."""
 
-    title: str
     mdp: MDP
     reward: jax.Array
     expert: Plan
@@ -83,40 +89,74 @@ class _Setting:
     off_road: jax.Array | None
 
 
-def run(*, size: int, regions: int, demonstrations: list[int], sets: int, seed: int, picture: str | None) -> None:
-    """Runs the job and prints its table; saves a picture where matplotlib is installed.
+def add_options(parser: Parser) -> None:
+    """The options without a command."""
+    parser.set_defaults(run=run)
+    parser.add_argument("--grid", type=count, default=16, help="rows of the gridworld; 0 for none (default 16)")
+    parser.add_argument("--regions", type=count, default=64, help="regions of the gridworld (default 64)")
+    parser.add_argument("--track", default="a", help="racetrack: a, b or the file of a map (default a)")
+    parser.add_argument(
+        "--demonstrations", type=positive, nargs="+", default=[2, 5, 10], help="on the racetrack (default 2 5 10)"
+    )
+    parser.add_argument("--sets", type=positive, default=20, help="sets of demonstrations (default 20)")
+    parser.add_argument("--seed", type=count, default=0, help="of the random key (default 0)")
+    parser.add_argument(
+        "--picture", default="jaxhom_policies.png", help="file of the picture; '' for none (default %(default)s)"
+    )
+    parser.add_argument("--progress", action="store_true", help="show progress also where stderr is no terminal")
+
+
+def run(options) -> None:
+    """Runs the job and prints its table, a row as soon as it is known; saves a picture where matplotlib is installed.
 
     Args:
-      size: rows of the gridworld; 0 leaves the gridworld out.
-      regions: its number of regions.
-      demonstrations: how many demonstrations on racetrack (a), one block of the table each.
-      sets: independent sets of demonstrations over which figures are averaged.
-      seed: of the random key.
-      picture: path of the picture; None for no picture.
+      options: of the command line. `grid` 0 leaves the gridworld out, `sets` is the number of independent sets of
+        demonstrations over which figures are averaged, and an empty `picture` asks for none.
+
+    Raises:
+      ValueError: if there is no such gridworld or racetrack.
     """
-    key = jax.random.key(seed)
-    grid_key, track_key, picture_key = jax.random.split(key, 3)
-    rows, policies = [], {}
-    total = sets * (len(GENERALIZATIONS) + 1) * (len(demonstrations) + 1)
-    with tqdm(total=total, desc="main job", unit="policy", leave=False) as bar:
-        for setting, domain in _settings(grid_key, track_key, size, regions, demonstrations, sets):
-            bar.set_description(setting.title)
-            rows.append((setting.title,) + ("",) * (len(HEADER) - 1))
-            found = _learn(setting, bar.update)
-            rows += [row.cells() for row in _evaluate(setting, found)] + [()]
-            first = {name: policy[0] for name, (policy, _) in found.items()}
-            policies.setdefault(type(domain), (domain, setting, first))
-    print(format_table(HEADER, rows[:-1]))
-    print(f"\nMeans over {sets} sets of demonstrations; exact evaluation in trials of the demonstrations' length")
+    grid_key, track_key, picture_key = jax.random.split(jax.random.key(options.seed), 3)
+    settings = _settings(grid_key, track_key, options)
+    titles = _titles(options)
+    table = GrowingTable(HEADER, max(map(len, [*titles, *(f"  {name}" for name in METHODS)])))
+    drawn: dict[type, tuple] = {}
+    total = len(titles) * options.sets * (len(GENERALIZATIONS) + 1)
+    with tqdm(total=total, unit="policy", leave=False, disable=not wants_progress(options)) as bar:
+        for title, (setting, domain) in zip(titles, settings, strict=True):
+            bar.set_description(title)
+            _say(table.rule() if drawn else table.header())
+            _say(table.line((title,) + ("",) * (len(HEADER) - 1)))
+            measure = _measurer(setting)
+            policies = {}
+            for name, policy, gap in _learn(setting, bar.update):
+                _say(table.line(measure(name, policy, gap).cells()))
+                policies[name] = policy[0]
+            drawn.setdefault(type(domain), (domain, setting, policies))
+    print(
+        f"\nMeans over {options.sets} sets of demonstrations; exact evaluation in trials of the demonstrations' length"
+    )
     print(f"(gridworld {_GRID_TRIAL}) or {_TRACK_TRIAL} steps (racetrack). `loss <=` and `LPAL gap` are per step.")
-    if picture and len(policies) == 2:
-        _draw(picture_key, picture, policies)
+    if options.picture and len(drawn) == 2:
+        _draw(picture_key, options.picture, drawn)
 
 
-def _settings(
-    grid_key, track_key, size: int, regions: int, counts: list[int], sets: int
-) -> Iterator[tuple[_Setting, Gridworld | Racetrack]]:
+def _say(line: str) -> None:
+    """Prints a line above the progress bar, at once even into a pipe."""
+    tqdm.write(line, file=sys.stdout)
+    sys.stdout.flush()
+
+
+def _titles(options) -> list[str]:
+    """Of the blocks, in the order of `_settings`."""
+    grid = [f"gridworld {options.grid}x{options.grid}, {options.regions} regions, 10 demonstrations"]
+    track = [f"racetrack ({options.track}), {number} demonstrations" for number in options.demonstrations]
+    return grid * bool(options.grid) + track
+
+
+def _settings(grid_key, track_key, options) -> Iterator[tuple[_Setting, Gridworld | Racetrack]]:
     """The blocks of the table, one by one."""
+    size, regions, sets = options.grid, options.regions, options.sets
     if size:
         world = gridworld(size, num_regions=regions)
         draw_key, sample_key = jax.random.split(grid_key)
@@ -128,41 +168,32 @@ def _settings(
             sample_demonstrations(k, world.mdp, policy, 10, _GRID_TRIAL)
             for k, policy in zip(keys, expert.policy, strict=True)
         ]
-        title = f"gridworld {size}x{size}, {regions} regions, 10 demonstrations"
-        yield _Setting(title, world.mdp, reward, expert, samples, _GRID_TRIAL, None, None), world
-    track = racetrack("a")
+        yield _Setting(world.mdp, reward, expert, samples, _GRID_TRIAL, None, None), world
+    track = racetrack(options.track)
     plan = optimal_policy(track.mdp, track.mdp.features @ track.weights)
     reward = jnp.broadcast_to(track.mdp.features @ track.weights, (sets, *plan.policy.shape))
     expert = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (sets, *leaf.shape)), plan)
-    for count in counts:
-        keys = jax.random.split(jax.random.fold_in(track_key, count), sets)
-        samples = [sample_demonstrations(k, track.mdp, plan.policy, count, _TRACK_DEMONSTRATION) for k in keys]
-        title = f"racetrack (a), {count} demonstrations"
-        yield (
-            _Setting(title, track.mdp, reward, expert, samples, _TRACK_TRIAL, track.terminal, track.off_road),
-            track,
-        )
+    for number in options.demonstrations:
+        keys = jax.random.split(jax.random.fold_in(track_key, number), sets)
+        samples = [sample_demonstrations(k, track.mdp, plan.policy, number, _TRACK_DEMONSTRATION) for k in keys]
+        yield _Setting(track.mdp, reward, expert, samples, _TRACK_TRIAL, track.terminal, track.off_road), track
 
 
-def _learn(setting: _Setting, progress: Callable[[int], object]) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Each method's policies [B, S, A] and, for LPAL, the certified gaps [B] (NaN elsewhere)."""
+def _learn(setting: _Setting, progress: Callable[[int], object]) -> Iterator[tuple[str, jax.Array, jax.Array]]:
+    """Each method's name, its policies [B, S, A] and, for LPAL, the certified gaps [B] (NaN elsewhere)."""
     mdp, samples = setting.mdp, setting.demonstrations
     no_gap = jnp.full(len(samples), jnp.nan)
-    found = {"expert": (setting.expert.policy, no_gap)}
+    yield EXPERT, setting.expert.policy, no_gap
     for name, generalize in GENERALIZATIONS.items():
         policies = []
         for demonstrations in samples:
             policies.append(generalize(mdp, demonstrations).policy)
             progress(1)
-        found[name] = (jnp.stack(policies), no_gap)
+        policies = jnp.stack(policies)
+        yield name, policies, no_gap
         if generalize is soft_local_homomorphism:
-            found[f"{name} + LPAL"] = _apprentice(mdp, *_expectations_of(mdp, found[name][0]))
+            yield f"{name} + LPAL", *_apprentice(mdp, feature_expectations(mdp, policies), policies)
             progress(len(samples))
-    return found
-
-
-def _expectations_of(mdp: MDP, policies: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return feature_expectations(mdp, policies), policies
 
 
 def _apprentice(mdp: MDP, expectations, initial_policy) -> tuple[jax.Array, jax.Array]:
@@ -172,43 +203,44 @@ def _apprentice(mdp: MDP, expectations, initial_policy) -> tuple[jax.Array, jax.
     return solution.policy, gap * (1.0 - mdp.discount)
 
 
-def _evaluate(setting: _Setting, found: dict[str, tuple[jax.Array, jax.Array]]) -> list[Row]:
-    """Means over the sets."""
+def _measurer(setting: _Setting) -> Callable[[str, jax.Array, jax.Array], Row]:
+    """What makes the rows of a block: means over the sets of a method's policies and gaps."""
     mdp = setting.mdp
     best = setting.expert.upper_bound(mdp) @ mdp.initial
     events = {} if setting.off_road is None else {"off_road": setting.off_road}
-    rows = []
-    expert_reward = None
-    for name, (policy, gap) in found.items():
-        result = evaluate_exactly(mdp, policy, setting.reward, setting.trial, terminal=setting.terminal, events=events)
+
+    def evaluate(policy):
+        return evaluate_exactly(mdp, policy, setting.reward, setting.trial, terminal=setting.terminal, events=events)
+
+    expert_reward = evaluate(setting.expert.policy).reward_per_step
+
+    def measure(name: str, policy: jax.Array, gap: jax.Array) -> Row:
+        result = evaluate(policy)
         loss = best - policy_value(mdp, policy, setting.reward) @ mdp.initial
-        if expert_reward is None:
-            expert_reward = result.reward_per_step
-        rows.append(
-            Row(
-                method=f"  {name}",
-                reward_per_step=float(result.reward_per_step.mean()),
-                relative=float((result.reward_per_step / expert_reward).mean()),
-                steps=float(result.steps.mean()) if setting.terminal is not None else np.nan,
-                off_roads=float(result.events["off_road"].mean()) if events else np.nan,
-                loss_bound=float((loss * (1.0 - mdp.discount)).mean()),
-                lpal_gap=float(gap.max()),
-            )
+        return Row(
+            method=f"  {name}",
+            reward_per_step=float(result.reward_per_step.mean()),
+            relative=float((result.reward_per_step / expert_reward).mean()),
+            steps=float(result.steps.mean()) if setting.terminal is not None else np.nan,
+            off_roads=float(result.events["off_road"].mean()) if events else np.nan,
+            loss_bound=float((loss * (1.0 - mdp.discount)).mean()),
+            lpal_gap=float(gap.max()),
         )
-    return rows
+
+    return measure
 
 
 def _draw(key, path: str, policies: dict) -> None:
     """Saves the picture of the first block of each domain."""
     try:
-        from jaxhom.plotting import learned_policy_figure
-    except ImportError:
-        print("No picture: matplotlib is not installed (pip install 'jaxhom[plot]').")
+        plotting = load_plotting()
+    except ImportError as error:
+        print(f"No picture: {error}")
         return
     world, grid_setting, grid_policies = policies[Gridworld]
     track, track_setting, track_policies = policies[Racetrack]
     shown = ("expert", "k-NN (hops)", "soft local homomorphism")
-    figure = learned_policy_figure(
+    figure = plotting.learned_policy_figure(
         world,
         grid_setting.reward[0],
         grid_setting.demonstrations[0],
@@ -219,5 +251,5 @@ def _draw(key, path: str, policies: dict) -> None:
         key=key,
         horizon=_TRACK_TRIAL,
     )
-    figure.savefig(path, dpi=120)
+    save_figure(path, figure)
     print(f"Picture of the learned policies: {path}")

@@ -1,4 +1,4 @@
-"""Options of the command line, and its exit codes: 0 done, 2 wrong input (one line says what), 130 interrupted."""
+"""The command line as a whole, and its exit codes: 0 done, 2 wrong input (one line says what), 130 interrupted."""
 
 import argparse
 import sys
@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import jax
 
-from jaxhom.cli import learn, main_job
-from jaxhom.interop import files
+from jaxhom.cli import evaluate, explain, learn, main_job, plot
+from jaxhom.cli.options import Parser
 
 _DESCRIPTION = """\
 Apprenticeship learning from a few demonstrations via soft local homomorphisms.
@@ -22,73 +22,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
-        if options.command == "learn":
-            learn.run(options)
-        else:
-            main_job.run(
-                size=options.grid,
-                regions=options.regions,
-                demonstrations=options.demonstrations,
-                sets=options.sets,
-                seed=options.seed,
-                picture=options.picture or None,
-            )
-    except (ValueError, OSError) as error:
-        print(f"jaxhom: error: {str(error).splitlines()[0]}", file=sys.stderr)
+        options.run(options)
+    except OSError as error:
+        print(f"jaxhom: error: {_of_file(error)}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("jaxhom: interrupted", file=sys.stderr)
+    except (ValueError, ImportError) as error:
+        print(f"jaxhom: error: {str(error).partition(chr(10))[0]}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as interruption:
+        print("; ".join(["jaxhom: interrupted", *map(str, interruption.args)]), file=sys.stderr)
         return 130
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         prog="python -m jaxhom", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--grid", type=_count, default=16, help="rows of the gridworld; 0 for none (default 16)")
-    parser.add_argument("--regions", type=_count, default=64, help="regions of the gridworld (default 64)")
-    parser.add_argument(
-        "--demonstrations", type=_positive, nargs="+", default=[2, 5, 10], help="on the racetrack (default 2 5 10)"
-    )
-    parser.add_argument("--sets", type=_positive, default=20, help="sets of demonstrations (default 20)")
-    parser.add_argument("--seed", type=_count, default=0, help="of the random key (default 0)")
-    parser.add_argument(
-        "--picture", default="jaxhom_policies.png", help="file of the picture; '' for none (default %(default)s)"
-    )
-    _add_learn(parser.add_subparsers(dest="command", title="commands", metavar="{learn}"))
+    main_job.add_options(parser)
+    commands = parser.add_subparsers(dest="command", title="commands", metavar="{learn,evaluate,explain,plot}")
+    for command in (learn, evaluate, explain, plot):
+        command.add_parser(commands)
     return parser
 
 
-def _add_learn(commands) -> None:
-    formats = files.__doc__.partition("\n\n")[2]
-    parser = commands.add_parser(
-        "learn",
-        help="learn a policy from a model and demonstrations of your own",
-        description="Learns a policy for every state of a model from demonstrations.",
-        epilog=f"files:\n  NumPy .npz archives (numpy.savez) of plain arrays\n\n{formats}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--mdp", required=True, metavar="MODEL.npz", help="the model")
-    parser.add_argument("--demonstrations", required=True, metavar="DEMOS.npz", help="the expert's trajectories")
-    parser.add_argument("--output", required=True, metavar="POLICY.npz", help="where to write the policy")
-    parser.add_argument("--method", choices=learn.METHODS, default=learn.METHODS[0], help="default: %(default)s")
-    parser.add_argument("--lpal", action="store_true", help="feed the policy's feature expectations to LPAL")
-    parser.add_argument("--distance", type=_positive, default=1, help="radius d of the local models (default 1)")
-    parser.add_argument("--threshold", type=float, default=0.0, help="largest error epsilon (default 0)")
-    parser.add_argument("--printed", action="store_true", help="the relation as printed, without the anchor")
-    parser.add_argument("--mutual", action="store_true", help="require similarity in both directions")
-
-
-def _count(text: str) -> int:
-    number = int(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"must not be negative, got {text}")
-    return number
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
-    return number
+def _of_file(error: OSError) -> str:
+    """`name: what happened`, without the number."""
+    if error.filename is None or error.strerror is None:
+        return str(error).partition("\n")[0]
+    return f"{error.filename}: {error.strerror}"

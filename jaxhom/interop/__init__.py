@@ -11,9 +11,10 @@ Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` it
 before it is needed.
 """
 
-from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
+from jaxhom.interop.environments import GymnasiumModel, from_gymnasium, make_environment
 from jaxhom.interop.files import (
     FileError,
+    load_arrays,
     load_demonstrations,
     load_mdp,
     load_policy,
@@ -42,9 +43,11 @@ __all__ = [
     "from_mdptoolbox",
     "from_samples",
     "from_scipy",
+    "load_arrays",
     "load_demonstrations",
     "load_mdp",
     "load_policy",
+    "make_environment",
     "save_demonstrations",
     "save_mdp",
     "save_policy",

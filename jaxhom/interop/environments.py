@@ -14,6 +14,7 @@ states of the environment stay as they are. That is right for every table.
 """
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +67,7 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
       (16, 4, 5)
     """
     if isinstance(env, str):
-        env = _make(env)
+        env = make_environment(env)
         try:
             return from_gymnasium(env, discount=discount, features=features, initial=initial, end_state=end_state)
         finally:
@@ -92,8 +93,20 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
     return GymnasiumModel(mdp=mdp, reward=reward, terminal=jnp.asarray(terminal))
 
 
-def _make(name: str):
-    """The environment of that id."""
+def make_environment(name: str, **options):
+    """Makes a Gymnasium environment.
+
+    Args:
+      name: its id, `"FrozenLake-v1"`.
+      **options: what its constructor takes, `is_slippery=False`.
+
+    Returns:
+      The environment.
+
+    Raises:
+      ValueError: if there is no such environment, or it refuses the options.
+      ImportError: if Gymnasium is not installed.
+    """
     try:
         import gymnasium
     except ImportError as error:
@@ -101,10 +114,14 @@ def _make(name: str):
             f"making {name!r} needs gymnasium, which is not installed: pip install 'jaxhom[interop]'"
         ) from error
     try:
-        return gymnasium.make(name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # the version is the caller's choice
+            return gymnasium.make(name, **options)
     except gymnasium.error.Error as error:
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"environment {name!r} cannot be made: {reason}") from None
+    except Exception as error:  # constructors raise what they come upon
+        reason = f"{type(error).__name__} {checks.in_one_line(str(error))}"
+    raise ValueError(f"environment {name!r} cannot be made: {reason}")
 
 
 def _table(env) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -6,6 +6,9 @@
                     probability       [S, A, N], rows sum to 1                        two
                     initial           [S], optional: uniform if missing
                     features          [S, A, K] or [S, K], optional
+    beside a model  reward            [S, A] or [S]                                   all optional,
+                    coordinates       [S, D], positions of the states                 read by the
+                    terminal          bool [S], where episodes end                    command line
     demonstrations  states, actions   integers [M, H] (or [H] for one trajectory)
                     length            integers [M], optional: steps of each trajectory; H if missing
     policy          policy            [S, A], rows sum to 1
@@ -33,14 +36,23 @@ class FileError(ValueError):
     """A file that cannot be read as what it should be; the message is one line that names it."""
 
 
-def load_mdp(path: str | os.PathLike) -> MDP:
+def load_mdp(path: str | os.PathLike, *, discount: float | None = None) -> MDP:
     """Reads a model (see the module's table), in the dtype of its probabilities.
 
+    Args:
+      path: the file.
+      discount: the model's, if the file holds none.
+
     Raises:
-      FileError: if the file is missing, truncated, of another kind, or holds invalid values.
+      FileError: if the file is missing, truncated, of another kind, or holds invalid values, or if there are two
+        discounts.
     """
     arrays = _read(path)
     options = {name: arrays[name] for name in ("initial", "features") if name in arrays}
+    if discount is not None:
+        if "discount" in arrays:
+            raise FileError(f"{path}: it has a discount of its own, {checks.in_one_line(arrays['discount'].tolist())}")
+        arrays["discount"] = np.asarray(discount)
     _require(path, arrays, "discount")
     try:
         if "transition" in arrays:
@@ -75,6 +87,16 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         return Demonstrations.from_trajectories([(s[:n], a[:n]) for s, a, n in rows])
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
+
+
+def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
+    """Reads those of the named arrays that a file holds, whatever else is in it; their values are not checked.
+
+    Raises:
+      FileError: if the file is missing, truncated or of another kind.
+    """
+    arrays = _read(path)
+    return {name: arrays[name] for name in names if name in arrays}
 
 
 def load_policy(path: str | os.PathLike) -> np.ndarray:

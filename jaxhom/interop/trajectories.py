@@ -19,6 +19,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.demonstrations import Demonstrations
 from jaxhom.interop.files import FileError
+from jaxhom.mdp import MDP
 
 COLUMNS = ("episode", "state", "action")
 _FIELDS = (("obs", "acts"), ("observations", "actions"))
@@ -115,7 +116,7 @@ def demonstrations_from_steps(
     return demonstrations_from_episodes(zip(*pieces, strict=True), to_states=to_states)
 
 
-def demonstrations_from_csv(path: str | os.PathLike) -> tuple[Demonstrations, ImportReport]:
+def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) -> tuple[Demonstrations, ImportReport]:
     """Reads a comma-separated file with one step a line.
 
     The first line names the columns. Needed are `episode` (any text), `state` and `action` (whole numbers from 0 on);
@@ -124,6 +125,7 @@ def demonstrations_from_csv(path: str | os.PathLike) -> tuple[Demonstrations, Im
 
     Args:
       path: the file, in UTF-8.
+      mdp: a model in which every state and action must exist.
 
     Returns:
       The demonstrations, episodes in the order in which they begin, and the report: final observations, and episodes
@@ -132,6 +134,7 @@ def demonstrations_from_csv(path: str | os.PathLike) -> tuple[Demonstrations, Im
     Raises:
       FileError: if the file is missing or no text, lacks a column, or has a wrong field (naming line and column).
     """
+    limits = (_LARGEST_INDEX,) * 2 if mdp is None else (mdp.num_states, mdp.num_actions)
     steps: dict[str, list[tuple[int, int | None]]] = {}
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -139,7 +142,7 @@ def demonstrations_from_csv(path: str | os.PathLike) -> tuple[Demonstrations, Im
             places = _places(path, next(reader, []))
             for row in reader:
                 if row:
-                    episode, state, action = _step(path, reader.line_num, row, places)
+                    episode, state, action = _step(path, reader.line_num, row, places, limits)
                     _append(path, reader.line_num, steps.setdefault(episode, []), state, action)
     except UnicodeDecodeError as error:
         raise FileError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
@@ -239,24 +242,24 @@ def _places(path, header: list[str]) -> list[int]:
     return [names.index(column) for column in COLUMNS]
 
 
-def _step(path, line: int, row: list[str], places: list[int]) -> tuple[str, int, int | None]:
+def _step(path, line: int, row: list[str], places: list[int], limits: tuple[int, int]) -> tuple[str, int, int | None]:
     """Episode, state and action of one line; None for an empty action."""
     if len(row) <= max(places):
         raise FileError(f"{path} line {line}: {len(row)} fields, but the first line names more columns")
     episode, state, action = (row[place].strip() for place in places)
     if not episode:
         raise FileError(f"{path} line {line}, column 'episode': is empty")
-    state = _whole_number(path, line, "state", state)
-    return episode, state, _whole_number(path, line, "action", action) if action else None
+    state = _whole_number(path, line, "state", state, limits[0])
+    return episode, state, _whole_number(path, line, "action", action, limits[1]) if action else None
 
 
-def _whole_number(path, line: int, column: str, text: str) -> int:
+def _whole_number(path, line: int, column: str, text: str, limit: int) -> int:
     is_plain = text.isascii() and text.isdigit() and len(text) < 16
     number = int(text) if is_plain else _whole_float(text)
     if number is None:
         raise FileError(f"{path} line {line}, column {column!r}: must be a whole number, got {text!r}")
-    if not 0 <= number < _LARGEST_INDEX:
-        raise FileError(f"{path} line {line}, column {column!r}: must lie in [0, {_LARGEST_INDEX}), got {text}")
+    if not 0 <= number < limit:
+        raise FileError(f"{path} line {line}, column {column!r}: must lie in [0, {limit}), got {text}")
     return int(number)
 
 

@@ -18,11 +18,13 @@ from jaxhom.domains.gridworld import ACTIONS as GRIDWORLD_ACTIONS
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import ACTIONS as RACETRACK_ACTIONS
 from jaxhom.domains.racetrack import Racetrack
+from jaxhom.domains.tile_map import TileMap
 from jaxhom.mdp import MDP
 from jaxhom.plotting.palette import AMOUNT, FAINT, INK, ROAD, START, WALL
 
 BAR_ROOM, LEVEL_ROOM = 1.2, 2.0  # inches beside the map, for a colour bar with numbers and one with names
 
+_LEAST_HEIGHT = 2.6  # inches, beside which the label of a colour bar finds room
 _CHECKER = 4  # chequers along the side of a finish cell
 _LEAST_PROBABILITY = 0.02  # of an action that gets an arrow
 
@@ -32,15 +34,15 @@ class Board:
     """What a picture needs of a domain, in NumPy: C cells, numbered as their states are.
 
     Attributes:
-      domain: the gridworld or racetrack.
+      domain: the gridworld, racetrack or tile map.
       shape: rows and columns of the map.
       cells: int [C, 2], (row, column).
-      is_open: bool [C], False on the finish line.
+      is_open: bool [C], False where no action is taken: on the finish line, in walls.
       per_cell: states per cell, 1 or 25.
       moves: int [A, 2], the (row, column) direction of each action.
     """
 
-    domain: Gridworld | Racetrack
+    domain: Gridworld | Racetrack | TileMap
     shape: tuple[int, int]
     cells: np.ndarray
     is_open: np.ndarray
@@ -85,11 +87,15 @@ class Board:
         return tiles.swapaxes(1, 2).reshape(self.shape[0] * side, self.shape[1] * side)
 
 
-def board_of(domain, kind=(Gridworld, Racetrack)) -> Board:
+def board_of(domain, kind=(Gridworld, Racetrack, TileMap)) -> Board:
     if not isinstance(domain, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        names = " or a ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"the domain must be a {names}, got {type(domain).__name__}")
+        names = " or ".join(f"a {kind.__name__}" for kind in kinds)
+        raise ValueError(f"the domain must be {names}, got {type(domain).__name__}")
+    if isinstance(domain, TileMap):
+        shape = (len(domain.rows), len(domain.rows[0]))
+        is_open = np.array([letter in ".S" for row in domain.rows for letter in row])
+        return Board(domain, shape, domain.coordinates, is_open, 1, np.array(domain.moves))
     directions = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
     if isinstance(domain, Gridworld):
         actions, cells, per_cell = GRIDWORLD_ACTIONS, np.asarray(domain.coordinates), 1
@@ -117,7 +123,7 @@ def ground(board: Board, ax: Axes | None, room: float = 0.0) -> Axes:
     rows, columns = board.shape
     if ax is None:
         scale = min(9.0 / columns, 5.5 / rows, 0.6)
-        size = (columns * scale + 0.8 + room, rows * scale + 0.8)
+        size = (columns * scale + 0.8 + room, max(rows * scale + 0.8, _LEAST_HEIGHT if room else 0.0))
         _, ax = plt.subplots(figsize=size, layout="constrained")
     if isinstance(board.domain, Gridworld):
         borders = borders_of(board, np.asarray(board.domain.region))

@@ -1,0 +1,137 @@
+"""Options that several commands share, and the kinds of values that they take."""
+
+import argparse
+import json
+
+from jaxhom.cli.methods import METHODS
+
+MODEL_HELP = """\
+models:
+  --env ID [NAME=VALUE ...]   a Gymnasium environment with a transition table, and options of its constructor;
+                              needs pip install 'jaxhom[interop]'
+  --mdp a, --mdp b            the racetracks that come with the library
+  --mdp MAP.track             a racetrack: one letter per cell, X or # wall, space or . road, S start, F or G finish
+  --mdp MODEL.npz             arrays of your own; see `python -m jaxhom learn --help` for their names
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, like all others of the command line."""
+
+    def error(self, message: str):
+        self.exit(2, f"jaxhom: error: {' '.join(message.split())} (see {self.prog} --help)\n")
+
+
+def add_command(commands, name: str, run, *, summary: str, epilog: str) -> Parser:
+    """A subcommand, whose epilog keeps its line breaks."""
+    parser = commands.add_parser(
+        name,
+        help=summary,
+        description=summary[0].upper() + summary[1:] + ".",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+def add_model_options(parser: Parser) -> None:
+    """Where the model comes from."""
+    group = parser.add_argument_group("model (see below)")
+    source = group.add_mutually_exclusive_group(required=True)
+    source.add_argument("--env", nargs="+", metavar=("ID", "NAME=VALUE"), help="a Gymnasium environment")
+    source.add_argument("--mdp", metavar="FILE", help="a model's .npz file, a racetrack's map, or a, b")
+    group.add_argument(
+        "--discount",
+        type=float,
+        metavar="G",
+        help="where the source has none (default 0.99 for environments and racetracks)",
+    )
+    group.add_argument(
+        "--end-state",
+        action="store_true",
+        help="environments: episodes end in one further state, rather than in absorbing ones",
+    )
+
+
+def add_demonstration_options(parser: Parser) -> None:
+    """Where the trajectories come from."""
+    group = parser.add_argument_group("demonstrations")
+    source = group.add_mutually_exclusive_group(required=True)
+    source.add_argument("--demonstrations", metavar="FILE", help="the expert's trajectories, .npz or .csv")
+    source.add_argument(
+        "--expert", type=positive, metavar="N", help="sample N from the optimal policy, if the model has a reward"
+    )
+    group.add_argument(
+        "--steps",
+        type=positive,
+        metavar="H",
+        help="length of sampled ones; shorter where the episode ends (default: an environment's limit, 20 on "
+        "racetracks, 100 elsewhere)",
+    )
+    group.add_argument("--seed", type=count, default=0, metavar="N", help="of the sampling (default 0)")
+
+
+def add_method_options(parser: Parser, names: tuple[str, ...] = tuple(METHODS)) -> None:
+    """How the expert's policy is extended."""
+    group = parser.add_argument_group("method")
+    listed = ", ".join(names[1:])
+    group.add_argument(
+        "--method", choices=names, default=names[0], metavar="NAME", help=f"{names[0]} (default), {listed}"
+    )
+    group.add_argument("--distance", type=positive, metavar="D", help="radius d of the local models (default 1)")
+    group.add_argument("--threshold", type=float, metavar="E", help="largest error epsilon of a similarity (default 0)")
+    group.add_argument("--mutual", action="store_true", help="require similarity in both directions")
+    group.add_argument(
+        "--printed", action="store_true", help="homomorphisms as the paper prints them, without the anchor"
+    )
+    group.add_argument(
+        "--tolerance",
+        type=float,
+        metavar="T",
+        help="of the homomorphism's linear programs (default 1e-4 local, 1e-3 global)",
+    )
+    group.add_argument("--max-iterations", type=positive, metavar="N", help="of the global program (default 20000)")
+    group.add_argument(
+        "--metric", choices=("hops", "euclidean"), help="of the nearest neighbours (default hops: steps in the model)"
+    )
+    group.add_argument(
+        "--progress", action="store_true", help="show progress and time left also where stderr is no terminal"
+    )
+
+
+def positive(text: str) -> int:
+    """A whole number from 1 on."""
+    number = count(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {text}")
+    return number
+
+
+def count(text: str) -> int:
+    """A whole number from 0 on."""
+    try:
+        number = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"must not be negative, got {text}")
+    return number
+
+
+def environment_options(words: list[str]) -> dict:
+    """`["is_slippery=false", "map_name=8x8"]` -> {"is_slippery": False, "map_name": "8x8"}; values are JSON or text.
+
+    Raises:
+      ValueError: if a word is no NAME=VALUE.
+    """
+    options = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals or not name.isidentifier():
+            raise ValueError(f"--env: expected NAME=VALUE after the id, got {word!r}")
+        try:
+            options[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(text, text))
+        except ValueError:
+            options[name] = text
+    return options

@@ -1,0 +1,61 @@
+"""Pictures of a problem, on its map if it has one, and by the number of the state otherwise. Needs matplotlib.
+
+matplotlib is imported by the functions alone: every other command works without it.
+"""
+
+import importlib
+
+from jaxhom.cli.sources import Problem
+from jaxhom.domains import Racetrack
+from jaxhom.occupancy import occupancy
+
+KINDS = ("policy", "occupancy", "trajectories", "generalization")
+
+
+def load_plotting():
+    """`jaxhom.plotting`, for files rather than for a screen.
+
+    Raises:
+      ImportError: if matplotlib is missing, saying how to install it.
+    """
+    plotting = importlib.import_module("jaxhom.plotting")
+    importlib.import_module("matplotlib").use("Agg")
+    return plotting
+
+
+def draw_policy(problem: Problem, policy, visited=None, speed=(0, 0)):
+    """A figure of a policy [S, A]; on racetracks that of cars of one speed."""
+    plotting = load_plotting()
+    if problem.domain is None:
+        return plotting.plot_policy_by_state(policy, visited=visited).figure
+    ax = plotting.plot_policy(problem.domain, policy, speed=speed)
+    if isinstance(problem.domain, Racetrack):
+        ax.set_title(f"cars of speed ({speed[0]}, {speed[1]})", loc="left", fontsize="medium")
+    return ax.figure
+
+
+def draw_occupancy(problem: Problem, policy):
+    """A figure of where a policy goes."""
+    plotting = load_plotting()
+    visits = occupancy(problem.mdp, policy)
+    if problem.domain is None:
+        return plotting.plot_occupancy_by_state(visits).figure
+    return plotting.plot_occupancy(problem.domain, visits).figure
+
+
+def draw_trajectories(problem: Problem, demonstrations):
+    """A figure of demonstrations."""
+    plotting = load_plotting()
+    if problem.domain is None:
+        return plotting.plot_trajectories_by_state(demonstrations).figure
+    return plotting.plot_trajectories(problem.domain, demonstrations).figure
+
+
+def draw_generalization(problem: Problem, general, speed=None):
+    """A figure of how far advice came and from how many states; on racetracks for one speed, or all if None."""
+    plotting = load_plotting()
+    if problem.domain is None:
+        return plotting.plot_radius_counts(general.radius).figure
+    if isinstance(problem.domain, Racetrack):
+        return plotting.plot_generalization(problem.domain, general, speed=speed)[0].figure
+    return plotting.plot_generalization(problem.domain, general)[0].figure

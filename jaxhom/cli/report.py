@@ -1,0 +1,121 @@
+"""What `learn` tells: tables as soon as their numbers are there, and the same in report.json."""
+
+import contextlib
+import time
+
+import numpy as np
+
+from jaxhom.cli.measures import measure, measures_table
+from jaxhom.cli.methods import settings_of
+from jaxhom.cli.results import Results
+from jaxhom.cli.sources import Problem
+from jaxhom.cli.tables import format_facts
+from jaxhom.pdhg import Status
+
+_MAX_RADII = 8  # that have a row each
+
+
+class Report:
+    """Prints and writes what is known so far; see the module.
+
+    Args:
+      problem: the model and what is known of it.
+      demonstrations: what is learned from.
+      origin: where they come from, in words.
+      visited: bool [S], the states in them.
+      options: of the command line.
+      results: where report.json goes.
+    """
+
+    def __init__(self, problem: Problem, demonstrations, origin: str, visited, options, results: Results):
+        self._problem, self._results = problem, results
+        mdp, terminal = problem.mdp, problem.terminal
+        # Where an episode has ended no action matters, and such states are no part of the counts.
+        self._matters = np.ones(mdp.num_states, bool) if terminal is None else ~terminal
+        sizes = {"states": mdp.num_states, "actions": mdp.num_actions, "features": mdp.num_features}
+        steps = int(np.asarray(demonstrations.mask).sum())
+        count, num_visited = demonstrations.num_trajectories, int(np.asarray(visited).sum())
+        self.content = {
+            "finished": False,
+            "options": {name: value for name, value in vars(options).items() if name not in ("run", "command")},
+            "model": {"name": problem.name, **sizes, "discount": float(mdp.discount)},
+            "demonstrations": {"origin": origin, "trajectories": count, "steps": steps, "states": num_visited},
+            "method": {"name": options.method, **settings_of(options)},
+        }
+        rows = [("model", problem.name)]
+        rows.append(("states, actions, features", ", ".join(map(str, sizes.values()))))
+        rows.append(("discount", f"{float(mdp.discount):g}"))
+        if terminal is not None:
+            self.content["model"]["terminal_states"] = int(terminal.sum())
+            rows.append(("states in which episodes end", _share(terminal)))
+        rows += [("demonstrations", origin), ("trajectories, steps", f"{count}, {steps}")]
+        self._tell("problem", [*rows, ("states demonstrated", _share(visited))])
+
+    def generalization(self, general, numbers: dict) -> None:
+        """Where advice was found.
+
+        Args:
+          general: the generalization.
+          numbers: what else is known of its making.
+        """
+        radius = np.asarray(general.radius)
+        levels, counts = np.unique(radius[self._matters & (radius > 0)], return_counts=True)
+        nothing = self._matters & (radius < 0)
+        by_radius = dict(zip(map(str, levels.tolist()), counts.tolist(), strict=True))
+        self.content["generalization"] = {"states_by_radius": by_radius, "nothing_found": int(nothing.sum()), **numbers}
+        rows = [("states generalized to", _share(self._matters & (radius > 0)))]
+        shown = len(levels) if len(levels) <= _MAX_RADII else _MAX_RADII - 1
+        rows += [(f"  advice from radius {level}", str(count)) for level, count in by_radius.items()][:shown]
+        if shown < len(levels):
+            rows.append((f"  advice from radius {levels[shown]} to {levels[-1]}", str(counts[shown:].sum())))
+        rows.append(("states without a vote (uniform policy)", _share(nothing)))
+        if "error_lower" in numbers:
+            rows.append(("error of the map", f"{numbers['error_lower']:.4g} <= e <= {numbers['error_upper']:.4g}"))
+        if "pairs_of_classes_solved" in numbers:
+            solved = f"{numbers['classes_of_local_models']}, {numbers['pairs_of_classes_solved']}"
+            rows.append(("classes of local models, pairs of them solved", solved))
+        self._tell("\ngeneralization", rows)
+
+    def lpal(self, solution) -> None:
+        """LPAL's certificate."""
+        margin, bound, status = float(solution.margin), float(solution.margin_bound), Status(int(solution.status))
+        self.content["lpal"] = {
+            "margin": margin,
+            "margin_bound": bound,
+            "status": status.name,
+            "iterations": int(solution.iterations),
+        }
+        facts = [("margin", f"{margin:.6g}"), ("no policy's margin exceeds", f"{bound:.6g}")]
+        self._tell("\nLPAL", [*facts, ("status", status.message)])
+
+    def values(self, policies: dict) -> None:
+        """What named policies achieve, where a reward is known."""
+        rows = measure(self._problem, policies, self._problem.trial)
+        self.content["values"] = [row.as_json() for row in rows]
+        self.content["steps_of_a_trial"] = self._problem.trial
+        self._results.report(self.content)
+        print(f"\n{measures_table(rows)}")
+        print(
+            f"value: discounted, over all time; the rest: of trials of at most {self._problem.trial} steps", flush=True
+        )
+
+    @contextlib.contextmanager
+    def timed(self, name: str):
+        """Notes the seconds that a stage takes."""
+        start = time.perf_counter()
+        yield
+        self.content[name] = round(time.perf_counter() - start, 3)
+
+    def finish(self) -> None:
+        """All stages are done."""
+        self.content["finished"] = True
+        self._results.report(self.content)
+
+    def _tell(self, title: str, facts: list[tuple[str, str]]) -> None:
+        print(format_facts(title, facts), flush=True)
+        self._results.report(self.content)
+
+
+def _share(mask) -> str:
+    mask = np.asarray(mask)
+    return f"{int(mask.sum())} ({100 * float(mask.mean()):.1f}%)"

@@ -1,0 +1,94 @@
+"""Where results go: a folder, or a single policy file. Whatever has been written stays whole if a run is interrupted.
+
+OUTPUT/demonstrations.npz    the trajectories that were learned from
+OUTPUT/generalization.npz    with LPAL: the policy that it started from; written before it starts
+OUTPUT/policy.npz            the learned policy [S, A], with visited, radius, support and certificates
+OUTPUT/report.json           everything that is printed, and the settings
+OUTPUT/*.png                 pictures, if matplotlib is installed
+"""
+
+import json
+import math
+import os
+from collections.abc import Callable
+
+from jaxhom.interop.files import save_demonstrations, save_policy
+
+
+class Results:
+    """What a run writes. A path that ends in .npz takes the policy alone.
+
+    Args:
+      path: folder, made if it is missing, or file.
+
+    Raises:
+      OSError: if the folder cannot be made, or that of the file is missing.
+    """
+
+    def __init__(self, path: str):
+        self.written: list[str] = []
+        self._path = path
+        self.is_folder = not path.lower().endswith(".npz")
+        if self.is_folder:
+            os.makedirs(path, exist_ok=True)
+        elif not os.path.isdir(os.path.dirname(path) or "."):
+            raise FileNotFoundError(2, "no such folder", os.path.dirname(path))
+
+    def policy(self, policy, *, is_final: bool, **arrays) -> None:
+        """Writes a policy and what is known of it; one that is not final makes way for the one that is."""
+        name = "policy.npz" if is_final else "generalization.npz"
+        path = os.path.join(self._path, name) if self.is_folder else self._path
+        save_policy(path, policy, **arrays)
+        self._note(path)
+
+    def demonstrations(self, demonstrations) -> None:
+        self._in_folder("demonstrations.npz", lambda path: save_demonstrations(path, demonstrations))
+
+    def report(self, report: dict) -> None:
+        self._in_folder("report.json", lambda path: write_json(path, report))
+
+    def picture(self, name: str, figure) -> None:
+        self._in_folder(f"{name}.png", lambda path: save_figure(path, figure))
+
+    def _in_folder(self, name: str, write: Callable[[str], None]) -> None:
+        if self.is_folder:
+            path = os.path.join(self._path, name)
+            write(path)
+            self._note(path)
+
+    def _note(self, path: str) -> None:
+        if path not in self.written:
+            self.written.append(path)
+
+
+def save_figure(path: str, figure) -> None:
+    """Writes a figure in the format that the name asks for, and forgets it.
+
+    Raises:
+      ValueError: if there is no such format.
+    """
+    import matplotlib.pyplot as plt
+
+    try:
+        figure.savefig(path, dpi=120)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    finally:
+        plt.close(figure)
+
+
+def write_json(path: str, content) -> None:
+    """Writes JSON, beside `path` first; NaN and infinity, which JSON has no word for, as null."""
+    partial = f"{path}.partial"
+    with open(partial, "w", encoding="utf-8") as file:
+        json.dump(_finite(content), file, indent=2, allow_nan=False)
+        file.write("\n")
+    os.replace(partial, path)
+
+
+def _finite(value):
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

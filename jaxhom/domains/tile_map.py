@@ -1,0 +1,68 @@
+"""A model whose states are the cells of a map, with actions that are moves: what a picture needs to know of it.
+
+Gridworlds and racetracks are domains of this library and know their geometry. A model that came from elsewhere,
+an environment's table say, has none; `TileMap` lays its states out on a map.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.mdp import MDP
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class TileMap:
+    """A model on a map: the cell (r, c) of R x C cells is state r C + c. Build it with `TileMap.from_rows`.
+
+    Attributes:
+      mdp: the model, S = R C states.
+      rows: the map, R strings of C letters: `#` (no state to act in: a wall, a hole), `.` (open), `S` (start), `F`
+        (goal).
+      moves: per action the (row, column) direction in which it is meant to lead; (0, 0) for staying.
+    """
+
+    mdp: MDP
+    rows: tuple[str, ...] = dataclasses.field(metadata={"static": True})
+    moves: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
+
+    @classmethod
+    def from_rows(cls, mdp: MDP, rows: Sequence[str], moves: Sequence[Sequence[int]]) -> "TileMap":
+        """Lays a model out.
+
+        Raises:
+          ValueError: if the map is not a rectangle of as many cells as the model has states, a letter is unknown, or
+            there is not one move per action.
+        """
+        rows = tuple(rows)
+        is_rectangle = len({len(row) for row in rows}) == 1
+        if not is_rectangle or sum(map(len, rows)) != mdp.num_states:
+            raise ValueError(f"rows must be equally long and have {mdp.num_states} cells, one per state")
+        for number, row in enumerate(rows):
+            if not set(row) <= set("#.SF"):
+                raise ValueError(f"rows[{number}] must be made of #, ., S and F, got {row!r}")
+        directions = checks.as_host_array("moves", moves)
+        expected = f"({mdp.num_actions}, 2)"
+        checks.require_shape("moves", directions, expected, directions.shape == (mdp.num_actions, 2))
+        return cls(mdp=mdp, rows=rows, moves=tuple((int(row), int(column)) for row, column in directions))
+
+    @property
+    def coordinates(self) -> np.ndarray:
+        """int [S, 2], (row, column) of every state."""
+        return np.stack(np.divmod(np.arange(self.mdp.num_states), len(self.rows[0])), axis=-1)
+
+    def state_of(self, cell: Sequence[int]) -> int:
+        """Returns the state of a cell (row, column).
+
+        Raises:
+          ValueError: if the cell is not on the map.
+        """
+        row, column = cell
+        height, width = len(self.rows), len(self.rows[0])
+        if not (0 <= row < height and 0 <= column < width):
+            raise ValueError(f"cell {tuple(cell)} is outside the {height} x {width} map")
+        return int(row) * width + int(column)

@@ -292,9 +292,10 @@ def section_algorithm1(quick: bool) -> list[dict]:
 
 
 def grid_demonstrations(size: int, horizon: int):
-    """A grid, and ten demonstrations of an expert whose reward is random over four regions."""
-    mdp = jaxhom.gridworld(size, num_regions=4).mdp
-    reward = mdp.features @ jaxhom.sample_weights(jax.random.key(1), 4)
+    """A grid, and ten demonstrations of an expert whose reward is random over regions of two by two cells."""
+    num_regions = (size // 2) ** 2
+    mdp = jaxhom.gridworld(size, num_regions=num_regions).mdp
+    reward = mdp.features @ jaxhom.sample_weights(jax.random.key(1), num_regions)
     policy = jaxhom.optimal_policy(mdp, reward).policy
     return mdp, jaxhom.sample_demonstrations(jax.random.key(2), mdp, policy, 10, horizon)
 

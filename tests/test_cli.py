@@ -1,5 +1,8 @@
 """The command line as a whole: the main job, help, and one clear line for whatever is wrong with any command."""
 
+import pathlib
+import re
+import shlex
 import subprocess
 import sys
 
@@ -9,6 +12,7 @@ from cli_cases import LAKE, STATES, TRACK, Files
 
 from jaxhom import interop
 from jaxhom.cli import main, main_job
+from jaxhom.cli.parser import make_parser
 from jaxhom.generalization import maximum_entropy, nearest_neighbors
 from jaxhom.lpal import LPALSolution
 
@@ -132,6 +136,17 @@ def test_help_explains(capsys, arguments, expected):
 )
 def test_wrong_options_are_one_line(capsys, arguments, message):
     assert message in error_of(capsys, *arguments)
+
+
+ROOT = pathlib.Path(__file__).parent.parent
+TEXTS = [ROOT / "README.md", ROOT / ".ci" / "run", *sorted((ROOT / "jaxhom" / "cli").glob("*.py"))]
+LINES = [line for text in TEXTS for line in re.findall(r"-m jaxhom ([a-z-][^`\n]* -[^`\n]*)", text.read_text())]
+COMMANDS = sorted({line for line in LINES if "--help" not in line})
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_in_texts_are_understood(command):
+    assert make_parser().parse_args(shlex.split(command)).run
 
 
 def test_module_runs():

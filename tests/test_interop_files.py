@@ -13,6 +13,7 @@ import small_models
 from jaxhom.demonstrations import Demonstrations
 from jaxhom.interop import (
     FileError,
+    load_arrays,
     load_demonstrations,
     load_mdp,
     load_policy,
@@ -45,6 +46,24 @@ def test_demonstrations_and_policies_come_back(tmp_path):
     with np.load(tmp_path / "policy", allow_pickle=False) as archive:
         np.testing.assert_array_equal(archive["radius"], [1, 2])
         assert archive["margin"] == 0.5
+
+
+def test_what_else_a_file_holds(tmp_path):
+    save_policy(tmp_path / "policy.npz", [[0.5, 0.5]], radius=[3], margin=0.25)
+    found = load_arrays(tmp_path / "policy.npz", "radius", "margin", "nothing")
+    assert set(found) == {"radius", "margin"} and found["margin"] == 0.25
+    np.testing.assert_array_equal(found["radius"], [3])
+
+
+def test_a_discount_for_a_model_without_one(tmp_path):
+    path = tmp_path / "model.npz"
+    np.savez(path, transition=np.ones((1, 1, 1)))
+    assert load_mdp(path, discount=0.5).discount == 0.5
+    with pytest.raises(FileError, match="discount must lie strictly between 0 and 1"):
+        load_mdp(path, discount=1.0)
+    np.savez(path, transition=np.ones((1, 1, 1)), discount=0.9)
+    with pytest.raises(FileError, match=r"it has a discount of its own, 0\.9"):
+        load_mdp(path, discount=0.5)
 
 
 def test_every_file_says_its_format_and_nothing_else_is_left_behind(tmp_path):

@@ -11,7 +11,7 @@ from jaxhom.occupancy import feature_expectations
 
 _EXAMPLES = """\
 examples:
-  python -m jaxhom evaluate lake/policy.npz --env FrozenLake-v1 is_slippery=false
+  python -m jaxhom evaluate lake/policy.npz --env FrozenLake-v1 map_name=8x8
   python -m jaxhom evaluate track/generalization.npz track/policy.npz --mdp a --trials 1000 --against expert.npz
 
 The optimal policy is shown beside them where a reward is known: that of an environment or a racetrack, or the array

@@ -9,7 +9,7 @@ from jaxhom.generalization import Generalization
 
 _EXAMPLES = """\
 examples:
-  python -m jaxhom explain 6 --env FrozenLake-v1 is_slippery=false --demonstrations lake/demonstrations.npz
+  python -m jaxhom explain 4,1 --env FrozenLake-v1 map_name=8x8 --demonstrations lake/demonstrations.npz
   python -m jaxhom explain 3,5 7,3,0,1 --mdp a --expert 2
 
 A state is a number; on maps also row,column, and on racetracks row,column,down,right with the car's speed. Model,

@@ -19,7 +19,7 @@ certificates, and saves a picture of the policies (with matplotlib installed).
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    options = _parser().parse_args(arguments)
+    options = make_parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
         options.run(options)
@@ -35,7 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parser() -> Parser:
+def make_parser() -> Parser:
+    """The parser of all commands; what it returns has a function `run` that takes it."""
     parser = Parser(
         prog="python -m jaxhom", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -5,6 +5,8 @@ matplotlib is imported by the functions alone: every other command works without
 
 import importlib
 
+import numpy as np
+
 from jaxhom.cli.sources import Problem
 from jaxhom.domains import Racetrack
 from jaxhom.occupancy import occupancy
@@ -55,7 +57,8 @@ def draw_generalization(problem: Problem, general, speed=None):
     """A figure of how far advice came and from how many states; on racetracks for one speed, or all if None."""
     plotting = load_plotting()
     if problem.domain is None:
-        return plotting.plot_radius_counts(general.radius).figure
+        matters = slice(None) if problem.terminal is None else ~problem.terminal
+        return plotting.plot_radius_counts(np.asarray(general.radius)[matters]).figure
     if isinstance(problem.domain, Racetrack):
         return plotting.plot_generalization(problem.domain, general, speed=speed)[0].figure
     return plotting.plot_generalization(problem.domain, general)[0].figure

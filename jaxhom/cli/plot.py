@@ -12,7 +12,7 @@ from jaxhom.interop.files import FileError, load_arrays
 
 _EXAMPLES = """\
 examples:
-  python -m jaxhom plot policy lake/policy.npz --env FrozenLake-v1 --output policy.png
+  python -m jaxhom plot policy lake/policy.npz --env FrozenLake-v1 map_name=8x8 --output policy.png
   python -m jaxhom plot generalization track/policy.npz --mdp a --speed 0 1 --output radius.svg
   python -m jaxhom plot trajectories drives.csv --mdp my.track --output drives.pdf
 

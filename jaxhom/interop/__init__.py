@@ -1,11 +1,11 @@
 """Ways in and out of the library: environments, models, data of others, and files.
 
-* `from_gymnasium`: an environment with a transition table, with its reward.
+* `from_gymnasium`, `make_environment`: an environment with a transition table, with its reward.
 * `from_mdptoolbox`, `from_scipy`: transition matrices.
 * `from_samples`: recorded transitions, with the uncertainty of each row.
 * `demonstrations_from_episodes`, `demonstrations_from_steps`, `demonstrations_from_csv`: trajectories of `imitation`,
   Minari, arrays and CSV files, with a report of what was dropped.
-* `save_*`, `load_*`: models, demonstrations and policies in `.npz` files.
+* `save_*`, `load_*`: models, demonstrations and policies in `.npz` files, and whatever else is in these.
 
 Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` itself. No other library is imported
 before it is needed.

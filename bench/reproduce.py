@@ -57,7 +57,7 @@ EXPERIMENTS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code: 0 done, 1 some rows failed, 2 wrong input, 130 stopped."""
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     failed = 0
     try:
@@ -94,17 +94,18 @@ def _is_wanted(name: str, patterns: Sequence[str]) -> bool:
     return not patterns or any(parts[: len(p.split("/"))] == p.split("/") for p in patterns)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m bench.reproduce", description=__doc__.splitlines()[0])
-    parser.add_argument("sweep", choices=EXPERIMENTS)
-    parser.add_argument("--draws", "--sets", type=int, help="draws per row (default 100 for table1, 50, 20)")
-    parser.add_argument("--rows", nargs="+", default=[], help="only these settings: grid16, grid16/64, track_a/2")
-    parser.add_argument("--methods", nargs="+", default=[], help="only these methods")
-    parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default 0)")
-    parser.add_argument("--retry", action="store_true", help="compute rows that failed once more")
+def parser() -> argparse.ArgumentParser:
+    """The command line's options."""
+    made = argparse.ArgumentParser(prog="python -m bench.reproduce", description=__doc__.splitlines()[0])
+    made.add_argument("sweep", choices=EXPERIMENTS)
+    made.add_argument("--draws", "--sets", type=int, help="draws per row (default 100 for table1, 50, 20)")
+    made.add_argument("--rows", nargs="+", default=[], help="only these settings: grid16, grid16/64, track_a/2")
+    made.add_argument("--methods", nargs="+", default=[], help="only these methods")
+    made.add_argument("--seed", type=int, default=0, help="of all random numbers (default 0)")
+    made.add_argument("--retry", action="store_true", help="compute rows that failed once more")
     output = ROOT / "bench" / "results"
-    parser.add_argument("--output", type=pathlib.Path, default=output, help="folder (default bench/results)")
-    return parser
+    made.add_argument("--output", type=pathlib.Path, default=output, help="folder (default bench/results)")
+    return made
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ def _table1(folder: pathlib.Path) -> str:
         [
             f"## Table I\n\n{_health(rows)}\n\nAverage reward per step ± half its interval (printed in the paper):",
             tables.to_markdown(*reward),
-            "Percent of the expert's reward in the same draw (of the printed expert's); † where the paper's number lies "
+            "Percent of the expert's reward in the same draw (of the printed expert's); † where the paper's number is "
             "outside our interval, * where it is out of reach of single draws and of the noise of 1000 trials, too:",
             tables.to_markdown(*ratio),
             *comparison.table1_words(cells, comparison.compare_orders(rows)),
@@ -118,9 +118,9 @@ def _normalisation(folder: pathlib.Path) -> str:
     return text and f"{text}\n\n{_NORMALISATION_NOTE}"
 
 
-_NORMALISATION_NOTE = """Eq. (6) adds up over time, as LPAL's flow constraints do. Divided by the demonstrations' length, the
-expectations hardly count against occupancies that sum to 1 / (1 - discount): LPAL then spreads its time evenly over the
-regions, which earns about the mean weight, 0.05 a step. The printed numbers are of that size."""
+_NORMALISATION_NOTE = """Eq. (6) adds up over time, as LPAL's flow constraints do. Divided by the demonstrations'
+length, the expectations hardly count against occupancies that sum to 1 / (1 - discount): LPAL then spreads its time
+evenly over the regions, which earns about the mean weight, 0.05 a step. The printed numbers are of that size."""
 
 
 def _needed(lines: Sequence[dict], domain: str, method: str) -> str:
@@ -163,7 +163,7 @@ def _health(rows: Sequence[Row]) -> str:
     good = [row for row in rows if not row.error]
     settings = {row.key[:8] for row in rows}
     draws = max((row.draw + 1 for row in rows), default=0)
-    solved = [row for row in good if row.status != "none"]
+    solved = [row for row in good if row.status not in ("", "none")]
     unsolved = sum(row.status != "SOLVED" for row in solved)
     gaps = [row.certificate for row in solved if row.certificate is not None]
     hours = sum(row.seconds or 0.0 for row in rows) / 3600

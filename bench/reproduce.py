@@ -7,14 +7,9 @@ tables, figures and words.
 
 import argparse
 import dataclasses
-import os
 import pathlib
 import sys
 from collections.abc import Callable, Sequence
-
-# Two batches at a time fill two cores. OpenBLAS, which reads this when NumPy loads, would start threads for each of
-# them, and small matrices then spend their time waiting: four times slower.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 

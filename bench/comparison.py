@@ -127,7 +127,7 @@ def table1_words(cells: Sequence[Cell], orders: Sequence[Order]) -> list[str]:
     paragraphs = [
         f"Of {len(judged)} printed ratios to the expert, {counts[AGREES]} lie within our 95% interval, widened by the "
         f"noise of the paper's 1000 trials; {counts[ONE_DRAW]} lie outside it but among 95% of our single draws, of "
-        f"which the paper has one per row; {counts[DIFFERS]} differ by more than that."
+        f"which the paper has one per row (†); {counts[DIFFERS]} differ by more than that (*)."
     ]
     paragraphs += [_cell_words(method, cells) for method in dict.fromkeys(cell.method for cell in cells)]
     lost = [order for order in orders if not order.is_reproduced]
@@ -141,16 +141,18 @@ def table1_words(cells: Sequence[Cell], orders: Sequence[Order]) -> list[str]:
 
 
 def _cell_words(method: str, cells: Sequence[Cell]) -> str:
-    """What to say of the cells of one method that differ; empty if none does."""
-    wrong = [cell for cell in cells if cell.method == method and cell.verdict == DIFFERS]
-    if not wrong:
-        return ""
-    listed = "; ".join(
-        f"{cell.grid}x{cell.grid} with {cell.regions} regions: {100 * cell.paper_ratio:.1f}% printed, "
-        f"{_percent(cell.ratio)} here"
-        for cell in wrong
-    )
-    return f"**{method}** differs by more than draws and trials explain. {listed}."
+    """What to say of the cells of one method that differ by more than the interval; empty if none does."""
+    meanings = {DIFFERS: "by more than draws and trials explain", ONE_DRAW: "but a single draw may differ as much"}
+    parts = []
+    for verdict, meaning in meanings.items():
+        listed = "; ".join(
+            f"{cell.grid}x{cell.grid} with {cell.regions} regions: {100 * cell.paper_ratio:.1f}% printed, "
+            f"{_percent(cell.ratio)} here"
+            for cell in cells
+            if (cell.method, cell.verdict) == (method, verdict)
+        )
+        parts += [f"{meaning}: {listed}."] if listed else []
+    return f"**{method}** differs from the paper, " + " It differs, ".join(parts) if parts else ""
 
 
 def _order_words(lost: Sequence[Order]) -> list[str]:
@@ -167,23 +169,90 @@ def _order_words(lost: Sequence[Order]) -> list[str]:
     return paragraphs
 
 
-def figure1_words(rows: Iterable[Row]) -> list[str]:
-    """Sentences on Algorithm 1 against k-NN, and on what the printed program does, per track."""
-    rows = list(rows)
+@dataclasses.dataclass(frozen=True)
+class CurveOrder:
+    """Whether one curve of Figure 1 is better than another, over all points of a track.
+
+    Attributes:
+      better, worse: methods. is_printed: whether the paper says so, or it is our question.
+      ours: interval over draws of better - worse, averaged over the points; positive where `better` is (of steps and
+        off-roads fewer are better).
+      clear, reversed: at how many of `points` points the interval lies above, or below, zero.
+    """
+
+    track: str
+    metric: str
+    better: str
+    worse: str
+    is_printed: bool
+    ours: Interval
+    clear: int
+    reversed: int
+    points: int
+
+
+_SOFT, _LPAL_SOFT = "soft_local_homomorphism", "lpal_soft_local_homomorphism"
+_PRINTED_ORDERS = [(_SOFT, "manhattan_knn", metric, ("track_a", "track_b")) for metric in METRICS] + [
+    ("lpal_full_policy", _LPAL_SOFT, "reward_per_step", ("track_a", "track_b")),
+    ("lpal_full_policy", "lpal_manhattan_knn", "reward_per_step", ("track_a", "track_b")),
+    (_SOFT, _LPAL_SOFT, "reward_per_step", ("track_b",)),
+    ("manhattan_knn", "lpal_manhattan_knn", "reward_per_step", ("track_b",)),
+]
+"""What section VI.B says of its Figure 1, whose numbers are not printed."""
+_OUR_ORDERS = [
+    (_SOFT, f"{_SOFT}_{relation}", metric, ("track_a", "track_b"))
+    for relation in ("printed", "mutual")
+    for metric in ("reward_per_step", "off_roads")
+]
+_METRIC_NAMES = {"reward_per_step": "reward per step", "steps": "steps", "off_roads": "off-roads per step"}
+
+
+def compare_curves(rows: Iterable[Row]) -> list[CurveOrder]:
+    """The orders that the paper claims for Figure 1, then those between the relations."""
+    values = {}  # (track, method, metric) -> {(demonstrations, draw): value}
+    for row in rows:
+        for metric in METRICS if not row.error else ():
+            curve = values.setdefault((row.domain, row.method, metric), {})
+            curve[row.demonstrations, row.draw] = getattr(row, metric)
+    orders = []
+    for better, worse, metric, tracks in _PRINTED_ORDERS + _OUR_ORDERS:
+        is_printed = (better, worse, metric, tracks) in _PRINTED_ORDERS
+        for track in tracks:
+            one, other = (values.get((track, method, metric), {}) for method in (better, worse))
+            sign = 1.0 if metric == "reward_per_step" else -1.0
+            gaps = {key: sign * (one[key] - other[key]) for key in one.keys() & other.keys()}
+            if gaps:
+                orders.append(CurveOrder(track, metric, better, worse, is_printed, *_over_points(gaps)))
+    return orders
+
+
+def _over_points(gaps: dict[tuple[int, int], float]) -> tuple[Interval, int, int, int]:
+    """Interval of the mean over points, points clearly above zero, below zero, all; from (point, draw) -> gap."""
+    points, draws = ({}, {})
+    for (point, draw), gap in sorted(gaps.items()):
+        points.setdefault(point, []).append(gap)
+        draws.setdefault(draw, []).append(gap)
+    whole = [np.mean(found) for found in draws.values() if len(found) == len(points)]
+    intervals = [mean_interval(found) for found in points.values()]
+    above, below = sum(i.low > 0 for i in intervals), sum(i.high < 0 for i in intervals)
+    return mean_interval(whole), above, below, len(points)
+
+
+def figure1_words(orders: Sequence[CurveOrder]) -> list[str]:
+    """A sentence per order; what is not reproduced says so."""
     sentences = []
-    for track in dict.fromkeys(row.domain for row in rows):
-        counts = sorted({row.demonstrations for row in rows if row.domain == track})
-        for other, name in _COMPARED.items():
-            parts = []
-            for metric in ("reward_per_step", "off_roads"):
-                difference = _paired(rows, track, counts[0], "soft_local_homomorphism", other, metric)
-                if difference.count:
-                    parts.append(f"{_METRIC_NAMES[metric]} {_signed(difference)}")
-            if parts:
-                sentences.append(
-                    f"{_track_name(track)}, {counts[0]} demonstrations: Algorithm 1 (anchored) against {name}: "
-                    f"{', '.join(parts)}."
-                )
+    for order in orders:
+        sign = 1.0 if order.metric == "reward_per_step" else -1.0
+        gap = f"{sign * order.ours.mean:+.3g} ± {order.ours.half_width:.2g}"
+        verdict = ""
+        if order.is_printed:
+            verdict = "open: " if order.ours.low <= 0 <= order.ours.high else "reproduced: "
+            verdict = "**not reproduced**: " if order.ours.high < 0 else verdict
+        sentences.append(
+            f"{_track_name(order.track)}, {verdict}{order.better} better than {order.worse} in "
+            f"{_METRIC_NAMES[order.metric]}: {gap} on average over {order.points} points, clear at {order.clear}, "
+            f"the other way round at {order.reversed}."
+        )
     return sentences
 
 
@@ -198,30 +267,9 @@ def largest_difference(rows: Iterable[Row], track: str, one: str, other: str) ->
     return max(gaps, default=np.nan)
 
 
-_COMPARED = {
-    "manhattan_knn": "k-NN",
-    "soft_local_homomorphism_printed": "the program as printed",
-    "soft_local_homomorphism_mutual": "similarity in both directions",
-}
-_METRIC_NAMES = {"reward_per_step": "reward per step", "steps": "steps", "off_roads": "off-roads per step"}
-
-
-def _paired(rows, track: str, count: int, one: str, other: str, metric: str) -> Interval:
-    values = {one: {}, other: {}}
-    for row in rows:
-        if (row.domain, row.demonstrations) == (track, count) and row.method in values and not row.error:
-            values[row.method][row.draw] = getattr(row, metric)
-    shared = sorted(values[one].keys() & values[other].keys())
-    return mean_interval([values[one][draw] - values[other][draw] for draw in shared])
-
-
 def _track_name(domain: str) -> str:
     return f"Racetrack ({domain.removeprefix('track_')})"
 
 
 def _percent(interval: Interval) -> str:
     return f"{100 * interval.mean:.1f}% [{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
-
-
-def _signed(interval: Interval) -> str:
-    return f"{interval.mean:+.3g} [{interval.low:+.3g}, {interval.high:+.3g}]"

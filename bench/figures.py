@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from bench.summaries import paper_table1
 from jaxhom.plotting import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 
 _GREY = "#777777"
@@ -25,6 +26,7 @@ STYLES = {
     "euclidean_knn": ("k-NN (Euclidean)", SKY, "P", "--"),
     "maximum_entropy": ("maximum entropy", GREEN, "v", "-."),
     "monte_carlo": ("LPAL with Monte Carlo", PURPLE, "X", ":"),
+    "monte_carlo_per_step": ("LPAL with Monte Carlo, per step", ORANGE, "o", ":"),
     "regression": ("regression", _GREY, "*", "-."),
     "lpal_soft_local_homomorphism": ("LPAL with soft local homomorphism", SKY, "v", "-."),
     "lpal_manhattan_knn": ("LPAL with k-NN", GREEN, "P", "--"),
@@ -36,7 +38,7 @@ _METRICS = {
     "off_roads": "off-roads per step",
     "ratio": "reward per step / expert's",
 }
-_DOMAINS = {"track_a": "racetrack (a)", "track_b": "racetrack (b)", "track_hairpin": "hairpin track"}
+_DOMAINS = {"track_a": "racetrack (a)", "track_b": "racetrack (b)", "track_corner": "corner track"}
 
 
 def figure1(lines: Sequence[dict]) -> Figure:
@@ -108,6 +110,29 @@ def enough_figure(lines: Sequence[dict]) -> Figure:
         ax.set(xscale="log", xlabel="demonstrations", ylabel=_METRICS["ratio"], ylim=(None, 1.02))
         ax.set_title(domain_name(domain), loc="left", fontsize="medium")
     _legend_below(figure, panels.flat, columns=4)
+    return figure
+
+
+def normalisation_figure(lines: Sequence[dict]) -> Figure:
+    """Monte Carlo's reward in the rows of Table I, by two normalisations of its expectations, and as printed."""
+    rows = _ordered((line["domain"], line["regions"]) for line in lines)
+    figure, ax = plt.subplots(figsize=(8.0, 3.8), layout="constrained")
+    for shift, method in ((-0.12, "monte_carlo"), (0.12, "monte_carlo_per_step")):
+        label, color, marker, _ = STYLES[method]
+        here = [_pick(lines, metric="reward_per_step", method=method, domain=d, regions=k) for d, k in rows]
+        at = [place + shift for place, found in enumerate(here) if found]
+        found = [found[0] for found in here if found]
+        mean = np.array([line["mean"] for line in found])
+        half = [0.5 * (line["ci_high"] - line["ci_low"]) for line in found]
+        ax.errorbar(at, mean, half, color=color, marker=marker, linestyle="none", label=label, capsize=3)
+    printed = [paper_table1().get((int(domain[4:]), regions, "monte_carlo")) for domain, regions in rows]
+    ax.plot(range(len(rows)), printed, color=BLACK, marker="_", markersize=14, linestyle="none", label="printed")
+    names = [f"{domain[4:]} x {domain[4:]}\n{regions}" for domain, regions in rows]
+    ax.set(xticks=range(len(rows)), xticklabels=names, xlabel="grid and regions", ylabel=_METRICS["reward_per_step"])
+    ax.set_ylim(bottom=0.0)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.grid(color="#DDDDDD", linewidth=0.6, axis="y")
+    _legend_below(figure, [ax], columns=3)
     return figure
 
 

@@ -14,18 +14,19 @@ import numpy as np
 
 import jaxhom
 from bench.problems import Problem, build_domain
-from jaxhom import Status
-from jaxhom.generalization import class_similarity
-from jaxhom.local_models import local_model_classes
+from bench.settings import Setting
+from jaxhom import MDP, Status
+from jaxhom.homomorphism import ClassSimilarity
+from jaxhom.local_models import LocalModelClasses, local_model_classes
 
 _SIMILARITY_TOLERANCE = 1e-4
-_MONTE_CARLO_TOLERANCE = 1e-7  # of LPAL's margin per step: with many regions margins are small
+_MONTE_CARLO_SHARE = 1e-3  # LPAL's gap as a share of what each of K regions gets of evenly spread time
 _MANY_FEATURES = 8  # from here on Monte Carlo's LPAL takes the interior-point method
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Learned:
-    """Policies [B, S, A]; per draw, [B], how the solver ended and its certificate (see `rows.Row`)."""
+    """Policies [B, S, A]; where a solver was at work, how it ended and its certificate per draw, [B] (`rows.Row`)."""
 
     policy: jnp.ndarray
     status: np.ndarray | None = None
@@ -37,41 +38,59 @@ Method = Callable[[Problem], Learned]
 
 def expert(problem: Problem) -> Learned:
     """The expert's own policies."""
-    plan, mdp = problem.expert, problem.domain.bare
-    value = jaxhom.policy_value(mdp, plan.policy, problem.reward)
-    loss = (plan.upper_bound(mdp) - value) @ mdp.initial * (1.0 - mdp.discount)
-    return Learned(plan.policy, np.full(len(loss), Status.SOLVED), np.asarray(loss))
+    return Learned(problem.expert.policy)
+
+
+class Decisions(ClassSimilarity):
+    """Decisions of Algorithm 1, which also keep how they ended.
+
+    Attributes:
+      status: the worst of all pairs of classes. excess: by how much the error of an accepted pair may exceed epsilon.
+    """
+
+    status, excess = Status.SOLVED, 0.0
+
+    def solve(self, pairs, *, progress=False):
+        found = super().solve(pairs, progress=progress)
+        accepted = found.upper[found.upper <= self.threshold + self.tolerance]
+        self.status = max(self.status, int(found.status.max(initial=Status.SOLVED)))
+        self.excess = max(self.excess, float((accepted - self.threshold).max(initial=0.0)))
+        return found
 
 
 def soft(problem: Problem, *, anchored: bool = True, mutual: bool = False) -> Learned:
     """Algorithm 1, with the setting's distance and threshold."""
     setting = problem.setting
-    states = None if problem.domain.terminal is None else ~problem.domain.terminal
-    policies, status = [], []
+    options = {"distance": setting.distance, "threshold": setting.threshold, "tolerance": _SIMILARITY_TOLERANCE}
+    options |= {"anchored": anchored, "mutual": mutual}
+    if problem.domain.terminal is not None:
+        options["states"] = ~problem.domain.terminal  # the finish line puts the car back, whatever the action
+    policies, decided = [], []
     for model, demonstrations in zip(problem.models, problem.demonstrations, strict=True):
-        similarity = _similarity(setting, model, anchored)
-        options = {"distance": setting.distance, "threshold": setting.threshold, "tolerance": _SIMILARITY_TOLERANCE}
-        options |= {"anchored": anchored, "mutual": mutual, "states": states, "similarity": similarity}
-        policies.append(jaxhom.soft_local_homomorphism(model, demonstrations, **options).policy)
-        status.append(Status.SOLVED)
-    return Learned(jnp.stack(policies), np.array(status), np.full(len(policies), _SIMILARITY_TOLERANCE))
+        decisions = _decisions(setting, model, anchored)
+        found = jaxhom.soft_local_homomorphism(model, demonstrations, similarity=decisions, **options)
+        policies.append(found.policy)
+        decided.append((decisions.status, decisions.excess))
+    status, excess = np.array(decided).T
+    return Learned(jnp.stack(policies), status, excess)
 
 
-def _similarity(setting, model, anchored):
+def _decisions(setting: Setting, model: MDP, anchored: bool) -> Decisions:
     """Decisions that all draws share, unless each has a model of its own."""
     if setting.samples:
-        return class_similarity(model, setting.distance, setting.threshold, anchored, _SIMILARITY_TOLERANCE)
-    return _shared_similarity(setting.domain, setting.distance, setting.threshold, anchored)
+        classes = local_model_classes(model, distance=setting.distance)
+        return Decisions(model, classes, setting.distance, anchored, _SIMILARITY_TOLERANCE, setting.threshold)
+    return _shared_decisions(setting.domain, setting.distance, setting.threshold, anchored)
 
 
 @functools.lru_cache(maxsize=32)
-def _shared_similarity(domain: str, distance: int, threshold: float, anchored: bool):
+def _shared_decisions(domain: str, distance: int, threshold: float, anchored: bool) -> Decisions:
     mdp, classes = _shared_classes(domain, distance)
-    return class_similarity(mdp, distance, threshold, anchored, _SIMILARITY_TOLERANCE, classes)
+    return Decisions(mdp, classes, distance, anchored, _SIMILARITY_TOLERANCE, threshold)
 
 
 @functools.lru_cache(maxsize=8)
-def _shared_classes(domain: str, distance: int):
+def _shared_classes(domain: str, distance: int) -> tuple[MDP, LocalModelClasses]:
     mdp = build_domain(domain, 1 if domain.startswith("grid") else 0).bare
     return mdp, local_model_classes(mdp, distance=distance)
 
@@ -123,15 +142,19 @@ def full_policy(problem: Problem) -> Learned:
     )
 
 
-def monte_carlo(problem: Problem) -> Learned:
-    """LPAL on the demonstrations' own averages."""
+def monte_carlo(problem: Problem, *, per_step: bool = False) -> Learned:
+    """LPAL on the demonstrations' own expectations.
+
+    `per_step` divides them by the demonstrations' length. They are then averages, where LPAL's flow constraints add up
+    over time, so that they hardly count: not what eq. (6) says, but what the printed numbers look like.
+    """
     mdp = problem.domain.mdp
-    means = [jaxhom.monte_carlo_feature_expectations(mdp, shown) for shown in problem.demonstrations]
-    options = {"method": "columns"}
+    found = jnp.stack([jaxhom.monte_carlo_feature_expectations(mdp, shown) for shown in problem.demonstrations])
+    options = {}
     if mdp.num_features > _MANY_FEATURES:
-        tolerance = _MONTE_CARLO_TOLERANCE / (1.0 - float(mdp.discount))
-        options = {"method": "interior_point", "tolerance": tolerance}
-    return _of_solution(mdp, jaxhom.lpal(mdp, jnp.stack(means), **options))
+        all_time = 1.0 / (1.0 - float(mdp.discount))
+        options = {"method": "interior_point", "tolerance": _MONTE_CARLO_SHARE * all_time / mdp.num_features}
+    return _of_solution(mdp, jaxhom.lpal(mdp, found / (problem.setting.length if per_step else 1), **options))
 
 
 def _of_solution(mdp, solution) -> Learned:
@@ -139,7 +162,8 @@ def _of_solution(mdp, solution) -> Learned:
     return Learned(solution.policy, np.asarray(solution.status), np.asarray(gap))
 
 
-def _plain(name: str, method: Method) -> Method:
+def plain(name: str, method: Method) -> Method:
+    """The method itself; its policies are kept for `apprentice(name, method)`."""
     return lambda problem: problem.once(name, lambda: method(problem))
 
 
@@ -158,28 +182,19 @@ TABLE1: dict[str, Method] = {
 FIGURE1: dict[str, Method] = {
     "expert": expert,
     "lpal_full_policy": full_policy,
-    "soft_local_homomorphism": _plain("soft", soft),
+    "soft_local_homomorphism": plain("soft", soft),
     "soft_local_homomorphism_printed": functools.partial(soft, anchored=False),
     "soft_local_homomorphism_mutual": functools.partial(soft, mutual=True),
-    "manhattan_knn": _plain("manhattan_knn", manhattan_knn),
+    "manhattan_knn": plain("manhattan_knn", manhattan_knn),
     "lpal_soft_local_homomorphism": apprentice("soft", soft),
     "lpal_manhattan_knn": apprentice("manhattan_knn", manhattan_knn),
 }
 """The curves of Figure 1; Algorithm 1 also with the program as printed, and asking for similarity both ways."""
 
-THRESHOLD: dict[str, Method] = {
-    "expert": expert,
-    "soft_local_homomorphism": soft,
-    "soft_local_homomorphism_mutual": functools.partial(soft, mutual=True),
-    "manhattan_knn": manhattan_knn,
-}
-
-NOISE: dict[str, Method] = {"expert": expert, "soft_local_homomorphism": soft, "manhattan_knn": manhattan_knn}
-
-ENOUGH: dict[str, Method] = {
-    "expert": expert,
-    "soft_local_homomorphism": soft,
-    "manhattan_knn": manhattan_knn,
-    "maximum_entropy": maximum_entropy,
+THRESHOLD: dict[str, Method] = {"expert": expert, "soft_local_homomorphism": soft, "manhattan_knn": manhattan_knn}
+NOISE = THRESHOLD
+ENOUGH: dict[str, Method] = {**THRESHOLD, "maximum_entropy": maximum_entropy, "monte_carlo": monte_carlo}
+NORMALISATION: dict[str, Method] = {
     "monte_carlo": monte_carlo,
+    "monte_carlo_per_step": functools.partial(monte_carlo, per_step=True),
 }

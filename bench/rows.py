@@ -35,8 +35,8 @@ class Row:
       expert_reward: the expert's reward per step in the same draw.
       sampled_reward, sampled_error: reward per step of 1000 trials, and its standard error.
       loss_bound: no policy is better by more, in discounted reward per step.
-      status: how the solver ended. certificate: LPAL's gap per step; for Algorithm 1 without LPAL, by how much the
-        errors of accepted pairs may exceed epsilon; for the expert, `loss_bound`.
+      status: how the solver ended, "none" where there is none (maximum entropy, say). certificate: LPAL's gap per step;
+        for Algorithm 1 by how much the errors of accepted pairs may exceed epsilon; without a solver `loss_bound`.
       seconds: per draw, compilation included. batch: draws that were solved together.
       error: why there are no numbers.
     """
@@ -142,7 +142,7 @@ def _commit() -> str:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        changed = git("status", "--porcelain", "--", "jaxhom", "bench/*.py")
+        changed = git("status", "--porcelain", "--", "jaxhom", "bench", ":!bench/results")
         return git("rev-parse", "--short=12", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return ""

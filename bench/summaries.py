@@ -6,7 +6,6 @@ mean and its interval. The questions have a line per setting, method and metric.
 """
 
 import csv
-import itertools
 import pathlib
 from collections.abc import Callable, Iterable, Sequence
 
@@ -81,11 +80,16 @@ def summarise_question(rows: Iterable[Row]) -> list[dict]:
 
 
 def grouped(rows: Iterable[Row], key: Callable[[Row], tuple]) -> list[tuple[tuple, list[Row]]]:
-    """Rows with numbers, grouped by `key` in the order in which keys first occur."""
-    good = [row for row in rows if not row.error]
-    order = {group_key: place for place, group_key in enumerate(dict.fromkeys(map(key, good)))}
-    ordered = sorted(good, key=lambda row: order[key(row)])
-    return [(group_key, list(group)) for group_key, group in itertools.groupby(ordered, key)]
+    """Rows with numbers, grouped by `key`; keys in the order of their numbers, names as they first occur."""
+    groups = {}
+    for row in rows:
+        if not row.error:
+            groups.setdefault(key(row), []).append(row)
+    places = {}
+    for parts in groups:
+        for part in parts:
+            places.setdefault(part, len(places) if isinstance(part, str) else part)
+    return sorted(groups.items(), key=lambda item: [places[part] for part in item[0]])
 
 
 def write_csv(path: pathlib.Path, columns: Sequence[str], lines: Iterable[dict]) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from bench.comparison import DIFFERS, Cell
+from bench.comparison import DIFFERS, ONE_DRAW, Cell
 from bench.intervals import Interval
 
 HEADINGS = {
@@ -16,6 +16,8 @@ HEADINGS = {
     "manhattan_knn": "Manhattan k-NN",
 }
 
+MARKS = {DIFFERS: "*", ONE_DRAW: "†"}
+
 
 def table1_reward(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
     """Header and rows: average reward per step, ours and (in brackets) the paper's."""
@@ -23,10 +25,10 @@ def table1_reward(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
 
 
 def table1_ratio(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: percent of the expert's reward in the same draw; * where the paper's differs, see the report."""
+    """Header and rows: percent of the expert's reward in the same draw, marked where the paper's differs."""
 
     def show(cell: Cell) -> str:
-        return _cell(cell.ratio, cell.paper_ratio, 100.0, 1) + ("*" if cell.verdict == DIFFERS else "")
+        return _cell(cell.ratio, cell.paper_ratio, 100.0, 1) + MARKS.get(cell.verdict, "")
 
     return _table1(cells, show)
 
@@ -62,5 +64,5 @@ def to_latex(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _latex_line(cells: Sequence[str]) -> str:
-    escaped = (cell.replace("%", r"\%").replace("_", r"\_").replace("±", r"$\pm$") for cell in cells)
-    return " & ".join(escaped) + r" \\"
+    replacements = {"&": r"\&", "%": r"\%", "_": r"\_", "±": r"$\pm$", "†": r"$^\dagger$", "*": r"$^*$"}
+    return " & ".join(cell.translate(str.maketrans(replacements)) for cell in cells) + r" \\"

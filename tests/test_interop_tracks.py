@@ -31,7 +31,7 @@ def test_a_track_file_with_a_header_is_a_racetrack(tmp_path):
 
 
 def test_the_benchmarks_own_track_is_read_from_its_file():
-    path = ROOT / "bench" / "tracks" / "hairpin.track"
+    path = ROOT / "bench" / "tracks" / "corner.track"
     lines = path.read_text().splitlines()
     track = racetrack(path)
     assert track.rows == racetrack([f"dim: {len(lines)} {len(lines[0])}", *lines]).rows

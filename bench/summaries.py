@@ -80,16 +80,13 @@ def summarise_question(rows: Iterable[Row]) -> list[dict]:
 
 
 def grouped(rows: Iterable[Row], key: Callable[[Row], tuple]) -> list[tuple[tuple, list[Row]]]:
-    """Rows with numbers, grouped by `key`; keys in the order of their numbers, names as they first occur."""
-    groups = {}
+    """Rows with numbers, grouped by `key`; keys in ascending order, but methods as they first occur."""
+    groups, places = {}, {}
     for row in rows:
+        places.setdefault(row.method, len(places))
         if not row.error:
             groups.setdefault(key(row), []).append(row)
-    places = {}
-    for parts in groups:
-        for part in parts:
-            places.setdefault(part, len(places) if isinstance(part, str) else part)
-    return sorted(groups.items(), key=lambda item: [places[part] for part in item[0]])
+    return sorted(groups.items(), key=lambda item: [places.get(part, part) for part in item[0]])
 
 
 def write_csv(path: pathlib.Path, columns: Sequence[str], lines: Iterable[dict]) -> None:

@@ -9,15 +9,19 @@ import subprocess
 import sys
 import time
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
 
 from bench import comparison, problems, report, reproduce, settings, summaries, sweep, tables
 from bench.intervals import mean_interval
-from bench.methods import FIGURE1, TABLE1, Learned, manhattan_knn, monte_carlo, soft
+from bench.methods import FIGURE1, TABLE1, Decisions, Learned, manhattan_knn, monte_carlo, soft
 from bench.rows import Row, RowFile, read_rows
 from bench.settings import Setting
+from jaxhom import Demonstrations, LocalSimilarity, empirical_policy
+from jaxhom.homomorphism import ClassSimilarity
+from jaxhom.local_models import local_model_classes
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SETTING = Setting("grid4", regions=4, demonstrations=2, pool=2, length=5, trial=5)
@@ -78,54 +82,66 @@ def test_a_file_of_another_version_is_refused(tmp_path, capsys):
 # ------------------------------------------------------------------------------------------- problems
 
 
-def test_a_draw_is_the_same_in_every_batch():
-    batch, alone = problems.draw_problem(SETTING, (0, 1), 0), problems.draw_problem(SETTING, (1,), 0)
-    np.testing.assert_array_equal(batch.reward[1], alone.reward[0])
-    np.testing.assert_array_equal(batch.demonstrations[1].states, alone.demonstrations[0].states)
-    other_seed = problems.draw_problem(SETTING, (1,), 1)
-    assert (np.asarray(other_seed.reward) != np.asarray(alone.reward)).any()
-
-
 @pytest.fixture(scope="module")
-def corner():
-    """Two draws on a track small enough for a test, with a known model and with an estimated one."""
-    few = settings.track("track_corner", 2, 3)
-    return [problems.draw_problem(dataclasses.replace(few, samples=samples), (0, 1), 0) for samples in (0, 4)]
+def problem():
+    """Two draws of the small setting."""
+    return problems.draw_problem(SETTING, (0, 1), 0)
 
 
-def test_the_action_on_the_finish_line_is_hidden(corner):
+def test_a_draw_is_the_same_in_every_batch(problem):
+    other = problems.draw_problem(SETTING, (1, 2), 0)
+    np.testing.assert_array_equal(problem.reward[1], other.reward[0])
+    np.testing.assert_array_equal(problem.demonstrations[1].states, other.demonstrations[0].states)
+    assert (np.asarray(problem.reward[0]) != np.asarray(problem.reward[1])).any()
+    other_seed = problems.draw_problem(SETTING, (0, 1), 1)
+    assert (np.asarray(problem.reward) != np.asarray(other_seed.reward)).any()
+
+
+def test_the_action_on_the_finish_line_is_hidden(rng):
     """Of the pool the learner sees the first trajectories, without the steps that put the car back."""
-    problem = corner[0]
-    terminal = np.asarray(problem.domain.terminal)
-    hidden = 0
-    for shown in problem.demonstrations:
-        assert shown.states.shape == (2, 10)
-        np.testing.assert_array_equal(shown.mask, ~terminal[np.asarray(shown.states)])
-        hidden += int((~shown.mask).sum())
-    assert hidden > 0
+    domain = problems.build_domain("track_corner", 0)
+    states = jnp.asarray(rng.integers(domain.bare.num_states, size=(2, 3, 10)))
+    samples = Demonstrations(states=states, actions=states % 5, mask=jnp.ones((2, 3, 10), bool))
+    shown = problems._shown(settings.track("track_corner", 2, 3), domain, samples)
+    terminal = np.asarray(domain.terminal)
+    assert len(shown) == 2 and terminal[states[:, :2]].any()
+    for lane, found in enumerate(shown):
+        np.testing.assert_array_equal(found.states, states[lane, :2])
+        np.testing.assert_array_equal(found.mask, ~terminal[states[lane, :2]])
+        visited, _ = empirical_policy(domain.bare, found)
+        assert not (np.asarray(visited) & terminal).any() and visited.any()
 
 
-def test_an_estimated_model_holds_frequencies(corner):
-    known, estimated = corner[0].domain.bare, corner[1].models[1]
-    frequencies = np.asarray(estimated.transition)
-    np.testing.assert_allclose(4 * frequencies, np.round(4 * frequencies), atol=1e-12)
-    assert (np.asarray(known.transition)[frequencies > 0] > 0).all()
-    assert (frequencies != np.asarray(corner[1].models[0].transition)).any()
+def test_an_estimated_model_holds_frequencies():
+    estimated = problems.draw_problem(dataclasses.replace(SETTING, samples=4), (0, 1), 0)
+    known = np.asarray(estimated.domain.bare.transition)
+    one, other = (np.asarray(model.transition) for model in estimated.models)
+    np.testing.assert_allclose(4 * one, np.round(4 * one), atol=1e-12)
+    assert (known[one > 0] > 0).all() and (one != other).any()
 
 
-def test_algorithm_1_says_how_it_ended(corner):
-    """At epsilon = 1 every pair is accepted, which is k-NN; the finish line's states need no policy."""
-    everything = dataclasses.replace(corner[0], setting=dataclasses.replace(corner[0].setting, threshold=1.0))
-    learned, neighbours = soft(everything), manhattan_knn(corner[0])
-    live = ~np.asarray(corner[0].domain.terminal)
-    np.testing.assert_allclose(learned.policy[:, live], neighbours.policy[:, live])
+def test_algorithm_1_says_how_it_ended(problem):
+    """At epsilon = 1 every pair is accepted, which is k-NN."""
+    everything = dataclasses.replace(problem, setting=dataclasses.replace(SETTING, threshold=1.0))
+    learned = soft(everything)
+    np.testing.assert_allclose(learned.policy, manhattan_knn(problem).policy)
     assert (learned.status == 0).all() and (learned.certificate <= 1e-4).all()
-    assert not np.allclose(soft(corner[0]).policy[:, live], neighbours.policy[:, live])
 
 
-def test_monte_carlo_per_step_is_even_over_regions():
+def test_decisions_keep_the_worst_end(problem, monkeypatch):
+    """The status of the worst pair, and the largest excess over epsilon of those that were accepted."""
+    lower, status = np.zeros(3), np.array([0, 2, 1])
+    found = LocalSimilarity(lower=lower, upper=np.array([0.1, 0.10005, 0.3]), iterations=status, status=status)
+    monkeypatch.setattr(ClassSimilarity, "solve", lambda self, pairs, **options: found)
+    mdp = problem.domain.bare
+    decisions = Decisions(mdp, local_model_classes(mdp), 1, True, 1e-4, 0.1)
+    assert (decisions.status, decisions.excess) == (0, 0.0)
+    assert decisions.solve(np.zeros((3, 2), int)) is found
+    assert decisions.status == 2 and decisions.excess == pytest.approx(5e-5)
+
+
+def test_monte_carlo_per_step_is_even_over_regions(problem):
     """Expectations that hardly count: the four regions of a noisy 4 x 4 grid get the same time in the long run."""
-    problem = problems.draw_problem(SETTING, (0, 1), 0)
     mdp = problem.domain.mdp
     features = np.asarray(mdp.features)
 
@@ -154,19 +170,19 @@ def test_a_sweep_computes_only_what_is_missing(tmp_path):
     """More draws and another method later; every row carries where it comes from."""
     file, calls = RowFile(tmp_path / "rows.csv"), []
     methods = {"expert": counting(METHODS["expert"], calls)}
-    sweep.run(sweep.Sweep([SETTING], methods, draws=2), file)
+    sweep.run(sweep.Sweep([SETTING], methods, draws=1), file)
     first = file.path.read_text()
-    sweep.run(sweep.Sweep([SETTING], methods, draws=2), file)
-    assert calls == [(0, 1)] and file.path.read_text() == first
+    sweep.run(sweep.Sweep([SETTING], methods, draws=1), file)
+    assert calls == [(0,)] and file.path.read_text() == first
     both = methods | {"maximum_entropy": METHODS["maximum_entropy"]}
-    sweep.run(sweep.Sweep([SETTING], both, draws=3, sampled=True), file)
+    sweep.run(sweep.Sweep([SETTING], both, draws=2, sampled=True), file)
     assert file.path.read_text().startswith(first)
-    assert file.path.read_text().count("\n") == 1 + 6
+    assert file.path.read_text().count("\n") == 1 + 4
     rows = file.read()
-    assert {(row.method, row.draw) for row in rows} == {(name, draw) for name in METHODS for draw in range(3)}
+    assert {(row.method, row.draw) for row in rows} == {(name, draw) for name in METHODS for draw in range(2)}
     for row in rows:
         assert row.dtype == "float64" and "jax " in row.versions and row.seconds > 0 and row.seed == 0
-        assert row.reward_per_step is not None and row.batch in (2, 3) and row.certificate < 1e-4
+        assert row.reward_per_step is not None and row.batch in (1, 2) and row.certificate < 1e-4
         if row.method == "expert":
             assert row.reward_per_step == pytest.approx(row.expert_reward) and row.status == "none"
             assert row.loss_bound == row.certificate
@@ -211,23 +227,34 @@ def test_an_interrupt_waits_for_the_method_in_progress(tmp_path, capsys):
         raise KeyboardInterrupt
 
     file = RowFile(tmp_path / "rows.csv")
-    methods = {"expert": METHODS["expert"], "stop": interrupted, "maximum_entropy": METHODS["maximum_entropy"]}
+    methods = {"expert": METHODS["expert"], "stop": interrupted, "after": METHODS["expert"]}
     with pytest.raises(KeyboardInterrupt):
         sweep.run(sweep.Sweep([SETTING], methods, draws=2), file)
     assert [row.method for row in file.read()] == ["expert", "expert"]
     assert "stopping" in capsys.readouterr().err
 
 
-def test_a_stopped_sweep_goes_on_where_it_was(tmp_path):
+TINY = """
+import sys
+from bench import methods, reproduce, settings
+
+chosen = {name: getattr(methods, name) for name in ("expert", "manhattan_knn")}
+tiny = [settings.Setting("grid4", 4, 2, 2, 5, 5, threshold=0.1 * i) for i in range(20)]
+reproduce.EXPERIMENTS["questions"] = [reproduce.Experiment("tiny", lambda: tiny, chosen, draws=2)]
+if __name__ == "__main__":
+    sys.exit(reproduce.main(sys.argv[1:]))
+"""
+
+
+def test_a_stopped_sweep_goes_on_where_it_was(tmp_path, monkeypatch):
     """SIGINT, later SIGKILL, as soon as new rows are on the disk; then to the end. Nothing is lost or done twice."""
-    command = [sys.executable, "-m", "bench.reproduce", "figure1", "--rows", "track_a", "--draws", "2"]
-    command += ["--methods", "expert", "manhattan_knn", "--output", str(tmp_path)]
-    path = tmp_path / "raw" / "figure1.csv"
+    command = ["questions", "--output", str(tmp_path)]
+    path = tmp_path / "raw" / "tiny.csv"
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     options = {"cwd": ROOT, "env": os.environ | cache, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     kept = []
     for stop, code in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
-        with subprocess.Popen(command, **options) as process:
+        with subprocess.Popen([sys.executable, "-c", TINY, *command], **options) as process:
             deadline = time.monotonic() + 300
             while process.poll() is None and time.monotonic() < deadline:
                 if path.exists() and path.read_bytes().count(b"\n") > len(kept) + 1:
@@ -238,14 +265,18 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path):
         assert process.returncode == code, errors.decode()
         assert (b"the same command goes on from here" in errors) == (stop == signal.SIGINT)
         rows = read_rows(path)
-        assert rows[: len(kept)] == kept and len(kept) < len(rows) < 36
+        assert rows[: len(kept)] == kept and len(kept) < len(rows) < 80
         kept = rows
-    subprocess.run(command, **options, check=True)
+    monkeypatch.setitem(reproduce.EXPERIMENTS, "questions", None)
+    exec(TINY, {"__name__": "tiny"})
+    assert reproduce.main(command) == 0
     rows = read_rows(path)
-    assert rows[: len(kept)] == kept and path.read_text().count("\n") == 1 + 36
-    keys = {(row.demonstrations, row.method, row.draw) for row in rows if not row.error}
-    assert keys == {(n, name, draw) for n in range(2, 11) for name in ("expert", "manhattan_knn") for draw in (0, 1)}
-    assert "a,2,expert,reward_per_step,2,14.6967," in (tmp_path / "figure1.csv").read_text()
+    assert rows[: len(kept)] == kept and path.read_text().count("\n") == 1 + 80
+    keys = {(row.threshold, row.method, row.draw) for row in rows if not row.error}
+    assert len(keys) == 80 and {(line["method"], line["draws"]) for line in read_csv(tmp_path / "tiny.csv")} == {
+        ("expert", "2"),
+        ("manhattan_knn", "2"),
+    }
 
 
 @pytest.mark.parametrize("name", ["table1", "figure1", "questions"])
@@ -403,7 +434,7 @@ def test_report_on_the_questions(tmp_path):
         RowFile(raw / "threshold.csv").append(rows)
     for samples in (0, 5):
         RowFile(raw / "noise.csv").append(question_rows("track_corner", samples=samples))
-    for count, ratio in ((1, 0.995), (2, 0.98), (5, 0.99), (10, 0.999)):
+    for count, ratio in ((1, 0.995), (2, 0.98), (5, 0.9905), (10, 1.004)):
         RowFile(raw / "enough.csv").append(question_rows("grid16", 64, demonstrations=count, ratio=ratio))
     RowFile(raw / "normalisation.csv").append(question_rows("grid16", 64, ("monte_carlo", "monte_carlo_per_step")))
     assert report.main(["--results", str(tmp_path)]) == 0

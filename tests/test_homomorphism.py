@@ -280,10 +280,19 @@ def test_chunks_of_pairs(monkeypatch):
     np.testing.assert_allclose(parts.upper, whole.upper, rtol=0, atol=1e-4)
 
 
-def test_progress_counts_all_pairs(capsys):
+def test_progress_counts_all_pairs(capsys, monkeypatch):
     mdp, _ = model_of("blocks")
+    bars = []
+
+    class Recorded(homomorphism_module.tqdm):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            bars.append(self)
+
+    monkeypatch.setattr(homomorphism_module, "tqdm", Recorded)
     local_similarity(mdp, [40, 6, 7], [41, 6, 20], progress=True)
-    assert "3/3" in capsys.readouterr().err
+    assert [(bar.n, bar.total) for bar in bars] == [(3, 3)]
+    assert "0/3" in capsys.readouterr().err
     local_similarity(mdp, [40], [41])
     assert capsys.readouterr().err == ""
 

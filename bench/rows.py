@@ -96,7 +96,7 @@ class RowFile:
 
     def append(self, rows: Iterable[Row]) -> None:
         """Writes rows in one piece, and has the disk hold them before it returns."""
-        self._write([[_to_text(getattr(row, name)) for name in COLUMNS] for row in rows])
+        self._write([[_to_text(name, getattr(row, name)) for name in COLUMNS] for row in rows])
 
     def read(self) -> list[Row]:
         """The rows, the latest of each key."""
@@ -157,11 +157,11 @@ def _drop_partial_line(path: pathlib.Path) -> bool:
     return whole > 0
 
 
-def _to_text(value) -> str:
+def _to_text(name: str, value) -> str:
     if value is None or value != value:
         return ""
     if isinstance(value, float):
-        return format(value, ".10g")
+        return repr(value) if name in KEY else format(value, ".10g")  # keys are to come back as they were
     return " ".join(str(value).split())  # one line
 
 

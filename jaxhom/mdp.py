@@ -26,25 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.padded_rows import PaddedRows, gather_sum, narrow_width, pad_rows
+from jaxhom.policy_chain import Edges, find_edges
 
 _DENSE_FRACTION = 0.25  # dense layout from N >= S / 4 on, where products beat gathers
-_MAX_UNROLL = 16
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class PaddedRows:
-    """Lists of entry indices per row, split so that a few long rows do not widen all of them.
-
-    Attributes:
-      narrow: int32 [R, W], the first W entries of every row; `sentinel` where a row is shorter.
-      wide_row: int32 [J], the rows that go on; once for every V further entries.
-      wide: int32 [J, V], those entries; `sentinel` where a row is shorter.
-    """
-
-    narrow: jax.Array
-    wide_row: jax.Array
-    wide: jax.Array
 
 
 @jax.tree_util.register_dataclass
@@ -60,6 +45,7 @@ class MDP:
       discount: float scalar, strictly between 0 and 1.
       wide_pairs: int32 [J], flat (s, a) indices of the pairs with successors beyond the narrow width.
       predecessors: per state s', the flat (s, a, slot) entries that lead to it; None in the dense layout.
+      edges: the graph's edges, for the chains of policies; None in the dense layout.
       narrow_width: slots that every sweep reads for every pair.
     """
 
@@ -70,6 +56,7 @@ class MDP:
     discount: jax.Array
     wide_pairs: jax.Array
     predecessors: PaddedRows | None
+    edges: Edges | None
     narrow_width: int = dataclasses.field(metadata={"static": True})
 
     @classmethod
@@ -154,12 +141,14 @@ class MDP:
         discount = checks.require_discount(discount, dtype)
         _require_contraction(probability, discount)
         dense = width == num_states
-        narrow_width, wide_pairs, predecessors = width, np.zeros(0, np.int32), None
+        slots, wide_pairs, predecessors, edges = width, np.zeros(0, np.int32), None, None
         if not dense:
             counts = (probability > 0).sum(axis=-1).ravel()
-            narrow_width = _narrow_width(counts)
-            wide_pairs = np.flatnonzero(counts > narrow_width).astype(np.int32)
-            predecessors = _transpose(next_state, probability)
+            slots = narrow_width(counts)
+            wide_pairs = np.flatnonzero(counts > slots).astype(np.int32)
+            entry = np.flatnonzero(probability > 0)
+            predecessors = pad_rows(entry, next_state.ravel()[entry], num_states, next_state.size)
+            edges = find_edges(next_state, probability)
         return cls(
             next_state=jnp.asarray(next_state, jnp.int32),
             probability=jnp.asarray(probability, dtype),
@@ -168,7 +157,8 @@ class MDP:
             discount=jnp.asarray(discount, dtype),
             wide_pairs=jnp.asarray(wide_pairs),
             predecessors=jax.tree.map(jnp.asarray, predecessors),
-            narrow_width=narrow_width,
+            edges=jax.tree.map(jnp.asarray, edges),
+            narrow_width=slots,
         )
 
     def replace(self, **changes) -> "MDP":
@@ -236,13 +226,13 @@ def expected_next_values(mdp: MDP, value: jax.Array) -> list[jax.Array]:
     if mdp.wide_pairs.size:
         # A wide row's expectation is computed beside the states' values and looked up like one more state.
         rows = mdp.next_state.reshape(-1, slots)[mdp.wide_pairs]
-        expectation = _gather_sum(rows, mdp.probability.reshape(-1, slots)[mdp.wide_pairs], value)
+        expectation = gather_sum(rows, mdp.probability.reshape(-1, slots)[mdp.wide_pairs], value)
         lookup = mdp.num_states + jnp.arange(mdp.wide_pairs.size, dtype=index.dtype)
         first = jnp.arange(width) == 0
         index = _replace_pairs(index, mdp.wide_pairs, jnp.where(first, lookup[:, None], 0))
         weight = _replace_pairs(weight, mdp.wide_pairs, first.astype(weight.dtype))
         value = jnp.concatenate([value, expectation])
-    return [_gather_sum(index[:, a], weight[:, a], value) for a in range(mdp.num_actions)]
+    return [gather_sum(index[:, a], weight[:, a], value) for a in range(mdp.num_actions)]
 
 
 def _replace_pairs(rows: jax.Array, pairs: jax.Array, replacement: jax.Array) -> jax.Array:
@@ -262,7 +252,7 @@ def push_forward(mdp: MDP, occupancy: jax.Array) -> jax.Array:
 
     def pull(entry):
         pair = jnp.minimum(entry // slots, flat.shape[0] - 1)
-        return _gather_sum(pair, entries[entry], flat)
+        return gather_sum(pair, entries[entry], flat)
 
     pushed = pull(rows.narrow)
     if rows.wide_row.size:
@@ -285,20 +275,6 @@ def check_policy_shape(mdp: MDP, policy: jax.Array, name: str = "policy") -> Non
     shape = (mdp.num_states, mdp.num_actions)
     good = jnp.ndim(policy) in (2, 3) and policy.shape[-2:] == shape
     checks.require_shape(name, policy, f"{shape} or (B, {shape[0]}, {shape[1]})", good)
-
-
-def _gather_sum(index: jax.Array, weight: jax.Array, values: jax.Array) -> jax.Array:
-    """sum_n weight[..., n] values[index[..., n]], with `values` [R] or [R, B]; unrolled while n is small."""
-    spread = (..., None) if values.ndim == 2 else ...
-    if index.shape[-1] > _MAX_UNROLL:
-        values = jnp.asarray(values)
-        # A loop over blocks of terms, each one fused pass: the gathered numbers never go through memory.
-        padding = [(0, 0)] * (index.ndim - 1) + [(0, -index.shape[-1] % _MAX_UNROLL)]
-        blocks = (*index.shape[:-1], -1, _MAX_UNROLL)
-        stacked = [jnp.moveaxis(jnp.pad(array, padding).reshape(blocks), -2, 0) for array in (index, weight)]
-        total = jnp.zeros(index.shape[:-1] + values.shape[1:], jnp.result_type(weight, values))
-        return jax.lax.scan(lambda total, block: (total + _gather_sum(*block, values), None), total, stacked)[0]
-    return sum(weight[..., n][spread] * values[index[..., n]] for n in range(index.shape[-1]))
 
 
 def _compress(transition: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -364,35 +340,3 @@ def _validated_features(features, num_states: int, num_actions: int, dtype) -> n
     if by_pair:
         return features
     return np.broadcast_to(features[:, None], (num_states, num_actions, features.shape[-1]))
-
-
-def _narrow_width(counts: np.ndarray) -> int:
-    """Width that minimises the slots read per sweep, all rows to the width and long rows to the end."""
-    longest = int(counts.max())
-    widths = np.unique(counts[counts > 0])
-    beyond = np.array([(counts > w).sum() for w in widths])
-    cost = counts.size * widths + beyond * (longest - widths)
-    best = int(np.argmin(cost))
-    return int(widths[best]) if 2 * cost[best] < cost[-1] else longest
-
-
-def _transpose(next_state: np.ndarray, probability: np.ndarray) -> PaddedRows:
-    """Lists, per s', the flat (s, a, slot) entries with positive probability that lead to it."""
-    num_states, sentinel = len(next_state), next_state.size
-    entry = np.flatnonzero(probability > 0)
-    target = next_state.ravel()[entry]
-    order = np.argsort(target, kind="stable")
-    entry, target = entry[order], target[order]
-    counts = np.bincount(target, minlength=num_states)
-    slot = np.arange(len(entry)) - (np.cumsum(counts) - counts)[target]
-    width = _narrow_width(counts)
-    narrow = np.full((num_states, width), sentinel, np.int32)
-    inside = slot < width
-    narrow[target[inside], slot[inside]] = entry[inside]
-    pieces = -(-np.maximum(counts - width, 0) // _MAX_UNROLL)  # a few rows may be far longer than the other long ones
-    first_piece = np.cumsum(pieces) - pieces
-    wide = np.full((pieces.sum(), _MAX_UNROLL), sentinel, np.int32)
-    piece, place = np.divmod(slot[~inside] - width, _MAX_UNROLL)
-    wide[first_piece[target[~inside]] + piece, place] = entry[~inside]
-    wide_row = np.repeat(np.arange(num_states), pieces)
-    return PaddedRows(narrow=narrow, wide_row=wide_row.astype(np.int32), wide=wide)

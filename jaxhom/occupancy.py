@@ -6,9 +6,9 @@ solutions of a linear system and of its transpose:
     (I - gamma P_pi)^T mu = alpha,   x(s, a) = mu(s) pi(s, a)        (the flow, Boularias and Chaib-draa eq. 3)
     (I - gamma P_pi)   V  = r_pi,    r_pi(s) = sum_a pi(s, a) r(s, a)
 
-Small models are solved by dense LU. Larger ones by BiCGSTAB on the two sweeps of `mdp`, followed, where Krylov
-stops short, by plain sweeps x <- b + gamma P x, which always contract. The residual is checked at the end: a
-solution that misses the tolerance (a policy that holds NaN, say) comes back as NaN, never as a wrong number.
+Small models are solved by dense LU. Larger ones by BiCGSTAB on the products with P_pi (see `policy_chain`), followed,
+where Krylov stops short, by plain sweeps x <- b + gamma P x, which always contract. The residual is checked at the end:
+a solution that misses the tolerance (a policy that holds NaN, say) comes back as NaN, never as a wrong number.
 Derivatives are implicit (one more solve with the transpose), whatever the method.
 
 Policies are [S, A] or a batch [B, S, A]; inside, the batch is the last axis.
@@ -21,6 +21,7 @@ import jax.numpy as jnp
 
 from jaxhom import checks
 from jaxhom.mdp import MDP, check_policy_shape, expected_next_values, push_forward, state_transition
+from jaxhom.policy_chain import policy_chain
 
 _MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
 _MAX_LU_STATES_DENSE = 256  # ... and products with the dense tensor
@@ -105,12 +106,31 @@ def _occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
     return state_occupancy[:, None] * policy
 
 
+def rough_state_occupancy(mdp: MDP, policy: jax.Array, residual: jax.Array) -> jax.Array:
+    """State occupancies mu [S, B] of policies [S, A, B], up to a residual of the flow: for inner loops, under `jit`.
+
+    Args:
+      mdp: the model.
+      policy: [S, A, B], rows sum to 1.
+      residual: scalar or [B], the 2-norm of (I - gamma P_pi)^T mu - alpha that is small enough. Expectations of a
+        feature within [-1, 1] are then off by at most sqrt(S) residual / (1 - gamma).
+
+    Returns:
+      mu [S, B]; NaN on lanes that missed the residual. Not to be differentiated.
+    """
+    initial = jnp.broadcast_to(mdp.initial[:, None], (mdp.num_states, policy.shape[2]))
+    if _is_small(mdp):
+        return _solve_by_lu(mdp, policy, initial, transpose=True)
+    forward, _ = _products(mdp, policy)
+    return _solve_by_krylov(mdp.discount, forward, initial, residual)
+
+
 def _solve_flow(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
     """Solves (I - gamma P_pi)^T mu = source; [S] or, batch last, [S, B]."""
     if _is_small(mdp):
         return _solve_by_lu(mdp, policy, source, transpose=True)
-    forward, backward = _sweeps(mdp, policy)
-    return _solve_by_sweeps(mdp.discount, forward, backward, source)
+    forward, backward = _products(mdp, policy)
+    return _solve_implicitly(mdp.discount, forward, backward, source)
 
 
 @jax.jit
@@ -118,17 +138,26 @@ def _solve_values(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
     """Solves (I - gamma P_pi) V = source; [S] or, batch last, [S, B]."""
     if _is_small(mdp):
         return _solve_by_lu(mdp, policy, source, transpose=False)
-    forward, backward = _sweeps(mdp, policy)
-    return _solve_by_sweeps(mdp.discount, backward, forward, source)
+    forward, backward = _products(mdp, policy)
+    return _solve_implicitly(mdp.discount, backward, forward, source)
 
 
 def _is_small(mdp: MDP) -> bool:
     return mdp.num_states <= (_MAX_LU_STATES_DENSE if mdp.is_dense else _MAX_LU_STATES)
 
 
-def _sweeps(mdp: MDP, policy: jax.Array) -> tuple[Callable, Callable]:
+def _products(mdp: MDP, policy: jax.Array) -> tuple[Callable, Callable]:
     """The products with P_pi^T and P_pi."""
+    if not mdp.is_dense:
+        if policy.ndim == 3 and policy.shape[2] == 1:  # gathers of single numbers, not of rows of one
+            return tuple(_on_one_lane(product) for product in _products(mdp, policy[..., 0]))
+        chain = policy_chain(mdp.edges, mdp.probability, policy)
+        return chain.push_forward, chain.expected_next_value
+    if policy.ndim == 2:
+        transition = state_transition(mdp, policy)
+        return lambda mu: mu @ transition, lambda value: transition @ value
 
+    # One matrix for all lanes: its product is worth more than the A times fewer numbers of a matrix per lane.
     def forward(mu):
         return push_forward(mdp, mu[:, None] * policy)
 
@@ -136,6 +165,10 @@ def _sweeps(mdp: MDP, policy: jax.Array) -> tuple[Callable, Callable]:
         return sum(policy[:, a] * v for a, v in enumerate(expected_next_values(mdp, value)))
 
     return forward, backward
+
+
+def _on_one_lane(product: Callable) -> Callable:
+    return lambda x: product(x[:, 0])[:, None]
 
 
 def _solve_by_lu(mdp: MDP, policy: jax.Array, source: jax.Array, transpose: bool) -> jax.Array:
@@ -149,15 +182,11 @@ def _solve_by_lu(mdp: MDP, policy: jax.Array, source: jax.Array, transpose: bool
     return solve(policy, source)
 
 
-def _solve_by_sweeps(discount, product: Callable, transposed: Callable, source) -> jax.Array:
+def _solve_implicitly(discount, product: Callable, transposed: Callable, source) -> jax.Array:
     """Solves x = source + discount * product(x), differentiable through `custom_linear_solve`."""
 
     def solver(operator):
-        def solve(_, b):
-            x = _bicgstab(lambda v: v - discount * operator(v), b)
-            return _sweep_until(lambda v: b + discount * operator(v), x, b, discount)
-
-        return solve
+        return lambda _, b: _solve_by_krylov(discount, operator, b)
 
     return jax.lax.custom_linear_solve(
         lambda x: x - discount * product(x),
@@ -167,13 +196,22 @@ def _solve_by_sweeps(discount, product: Callable, transposed: Callable, source) 
     )
 
 
-def _residual_tolerance(x: jax.Array, b: jax.Array) -> jax.Array:
-    """Residual to reach per lane, in the 2-norm: a small multiple of what rounding in x and b leaves."""
-    scale = jnp.linalg.norm(x, axis=0) + jnp.linalg.norm(b, axis=0)
-    return 16.0 * jnp.finfo(b.dtype).eps * scale
+def _solve_by_krylov(discount, product: Callable, b: jax.Array, residual: jax.Array | float = 0.0) -> jax.Array:
+    """Solves x = b + discount * product(x) to the 2-norm `residual` per lane, or as far as rounding allows."""
+    x = _bicgstab(lambda v: v - discount * product(v), b, residual)
+    return _sweep_until(lambda v: b + discount * product(v), x, b, discount, residual)
 
 
-def _bicgstab(system: Callable, b: jax.Array) -> jax.Array:
+def _norm(x: jax.Array) -> jax.Array:
+    return jnp.sqrt((x * x).sum(axis=0))
+
+
+def _goal(x: jax.Array, b: jax.Array, residual) -> jax.Array:
+    """Residual to reach per lane, in the 2-norm: at the least a small multiple of what rounding in x and b leaves."""
+    return jnp.maximum(residual, 16.0 * jnp.finfo(b.dtype).eps * (_norm(x) + _norm(b)))
+
+
+def _bicgstab(system: Callable, b: jax.Array, goal: jax.Array | float) -> jax.Array:
     """Batched BiCGSTAB (van der Vorst 1992); lanes are the trailing axis and stop one by one.
 
     A lane that breaks down stops where it is; the caller's sweeps take over from there.
@@ -186,17 +224,11 @@ def _bicgstab(system: Callable, b: jax.Array) -> jax.Array:
         ok = denominator != 0
         return jnp.where(ok, numerator / jnp.where(ok, denominator, 1.0), 0.0)
 
-    def is_active(state):
-        x, residual, _, rho, _ = state
-        tolerance = 0.5 * _residual_tolerance(x, b)
-        return (jnp.linalg.norm(residual, axis=0) > tolerance) & (rho != 0)
-
     def keep_going(state):
-        return jnp.any(is_active(state)) & (state[-1] < _MAX_KRYLOV_STEPS)
+        return jnp.any(state[4]) & (state[-1] < _MAX_KRYLOV_STEPS)
 
     def step(state):
-        x, residual, direction, rho, count = state
-        active = is_active(state)
+        x, residual, direction, rho, active, count = state
         product = system(direction)
         alpha = safe(rho, dot(shadow, product))
         half = residual - alpha * product
@@ -207,31 +239,33 @@ def _bicgstab(system: Callable, b: jax.Array) -> jax.Array:
         new_rho = dot(shadow, new_residual)
         beta = safe(new_rho, rho) * safe(alpha, omega)
         new_direction = new_residual + beta * (direction - omega * product)
-        finite = jnp.isfinite(dot(new_x, new_x) + dot(new_direction, new_direction))
+        size = _norm(new_residual)
+        finite = jnp.isfinite(size + new_rho + beta)  # a lane that overflowed is out, and stays where it was
         take = active & finite
-        new_rho = jnp.where(finite, new_rho, 0.0)  # a lane that overflowed is out
         choose = lambda new, old: jnp.where(take, new, old)  # noqa: E731
         return (
             choose(new_x, x),
             choose(new_residual, residual),
             choose(new_direction, direction),
-            jnp.where(active, new_rho, rho),
+            choose(new_rho, rho),
+            take & (new_rho != 0) & (size > 0.5 * _goal(new_x, b, goal)),
             count + 1,
         )
 
     # Any fixed dense vector will do. Not b: from a single start state it would see nothing of what moves on.
     shadow = 1.0 + jnp.sin(jnp.arange(len(b), dtype=b.dtype) ** 2)
     shadow = jnp.broadcast_to(shadow.reshape(-1, *(1,) * (b.ndim - 1)), b.shape)
-    start = (jnp.zeros_like(b), b, b, dot(shadow, b), jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(keep_going, step, start)[0]
+    rho = dot(shadow, b)
+    active = (rho != 0) & (_norm(b) > 0.5 * _goal(jnp.zeros_like(b), b, goal))
+    return jax.lax.while_loop(keep_going, step, (jnp.zeros_like(b), b, b, rho, active, jnp.zeros((), jnp.int32)))[0]
 
 
-def _sweep_until(sweep: Callable, x: jax.Array, b: jax.Array, discount) -> jax.Array:
-    """Applies the contraction `sweep` until its change is rounding on every lane; NaN where it never is."""
+def _sweep_until(sweep: Callable, x: jax.Array, b: jax.Array, discount, residual) -> jax.Array:
+    """Applies the contraction `sweep` until its change is small enough on every lane; NaN where it never is."""
     limit = jnp.log(jnp.finfo(x.dtype).eps) / jnp.log(discount) + 10
 
     def is_rough(x, swept, factor=1.0):
-        return ~(jnp.linalg.norm(swept - x, axis=0) <= factor * _residual_tolerance(x, b))
+        return ~(_norm(swept - x) <= factor * _goal(x, b, residual))
 
     def keep_going(state):
         x, swept, count = state

@@ -17,6 +17,8 @@ PACKAGE = ROOT / "jaxhom"
 ROWS = {
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
     "canonical_forms": -1,  # arrays in, keys out
+    "padded_rows": -1,  # arrays in, arrays out
+    "policy_chain": -0.5,
     "mdp": 0,
     "occupancy": 1,
     "planning": 1,
@@ -24,6 +26,7 @@ ROWS = {
     "local_models": 1,
     "lane_queue": 0.5,
     "inverse_factor": 0.5,
+    "game_interior_point": 0.6,
     "pdhg": 1,
     "homomorphism_newton": 1.2,
     "interior_point": 1.3,

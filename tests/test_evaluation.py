@@ -221,6 +221,7 @@ def test_the_dense_layout_is_the_sparse_one(case):
         probability=jnp.asarray(transition),
         next_state=jnp.broadcast_to(jnp.arange(S), transition.shape),
         predecessors=None,
+        edges=None,
         narrow_width=S,
     )
     assert dense.is_dense

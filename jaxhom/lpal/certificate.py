@@ -4,8 +4,6 @@ Any policy bounds v* from below by its margin min_i V_i(pi) - Vhat_i, one linear
 from above by max_pi w . V(pi) - w . Vhat, one planning problem. Neither relies on how pi or w were found.
 """
 
-import functools
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -54,7 +52,7 @@ def bound_by_planning(mdp: MDP, expectations, weights, value, tolerance) -> tupl
     """The bound of weights [B, K]: the value of planning for them, its own error added.
 
     Args:
-      mdp: the model.
+      mdp: the model; its features may be [S, 1, K].
       expectations: [B, K].
       weights: [B, K], in the simplex.
       value: [B, S], a start for planning.
@@ -63,6 +61,7 @@ def bound_by_planning(mdp: MDP, expectations, weights, value, tolerance) -> tupl
     # In float32 a projection can leave a sum that is off by 1e-4, and the bound with it.
     weights = weights / weights.sum(axis=-1, keepdims=True)
     reward = jnp.einsum("sak,bk->bsa", mdp.features, weights)
+    reward = jnp.broadcast_to(reward, (len(weights), mdp.num_states, mdp.num_actions))
     residual = 0.1 * tolerance * (1.0 - mdp.discount)
     plan = optimal_policy(mdp, reward, initial_value=value, tolerance=residual)
     best, target = plan.upper_bound(mdp) @ mdp.initial, weights * expectations
@@ -93,9 +92,9 @@ def policy_from_occupancy(mdp: MDP, x: jax.Array, fallback: jax.Array) -> jax.Ar
     return jnp.where(occurs, x / jnp.where(occurs, total, 1.0), fallback)
 
 
-@functools.partial(jax.jit, static_argnames="stopped")
+@jax.jit
 def certify(mdp, expectations, x, bound, tolerance, iterations, *, stopped) -> LPALSolution:
-    """The solution whose policy is read off the occupancy x [B, S, A]; `stopped` is the status of an open gap."""
+    """The solution whose policy is read off the occupancy x [B, S, A]; `stopped` (or [B]) is that of an open gap."""
     policy = policy_from_occupancy(mdp, x, bound.policy)
     true_occupancy = occupancy(mdp, policy)
     expected = jnp.einsum("bsa,sak->bk", true_occupancy, mdp.features)

@@ -1,0 +1,98 @@
+"""Ragged lists of indices as rectangular arrays, and weighted sums over them.
+
+Sparse products run on padded rows: entry [r, n] names the n-th number that row r adds up. Rows that are far longer
+than most (a restart anywhere on a track, say) would make every row pay for them, so they are kept apart.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_MAX_UNROLL = 16
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PaddedRows:
+    """One list per row, split so that a few long ones do not widen all of them.
+
+    Attributes:
+      narrow: [R, W, ...], the first W items of every row; a sentinel where a row is shorter.
+      wide_row: int32 [J], the rows that go on; once for every V further items.
+      wide: [J, V, ...], those items; the sentinel where a row is shorter.
+    """
+
+    narrow: jax.Array
+    wide_row: jax.Array
+    wide: jax.Array
+
+    def lookup(self, table: jax.Array) -> "PaddedRows":
+        """The rows with every item i replaced by table[i]."""
+        return PaddedRows(narrow=table[self.narrow], wide_row=self.wide_row, wide=table[self.wide])
+
+
+def pad_rows(items: np.ndarray, owner: np.ndarray, num_rows: int, sentinel: int) -> PaddedRows:
+    """Lists, per row, the items that it owns, in their order: items and owner [n], owner in [0, num_rows)."""
+    order = np.argsort(owner, kind="stable")
+    items, owner = items[order], owner[order]
+    counts = np.bincount(owner, minlength=num_rows)
+    place = np.arange(len(items)) - (np.cumsum(counts) - counts)[owner]
+    width = narrow_width(counts)
+    narrow = np.full((num_rows, width), sentinel, np.int32)
+    inside = place < width
+    narrow[owner[inside], place[inside]] = items[inside]
+    pieces = -(-np.maximum(counts - width, 0) // _MAX_UNROLL)  # a few rows may be far longer than the other long ones
+    first_piece = np.cumsum(pieces) - pieces
+    wide = np.full((pieces.sum(), _MAX_UNROLL), sentinel, np.int32)
+    piece, slot = np.divmod(place[~inside] - width, _MAX_UNROLL)
+    wide[first_piece[owner[~inside]] + piece, slot] = items[~inside]
+    wide_row = np.repeat(np.arange(num_rows), pieces)
+    return PaddedRows(narrow=narrow, wide_row=wide_row.astype(np.int32), wide=wide)
+
+
+def narrow_width(counts: np.ndarray) -> int:
+    """Width that minimises the items read per sweep, all rows to the width and long rows to the end."""
+    longest = int(counts.max())
+    widths = np.unique(counts[counts > 0])
+    beyond = np.array([(counts > w).sum() for w in widths])
+    cost = counts.size * widths + beyond * (longest - widths)
+    best = int(np.argmin(cost))
+    return int(widths[best]) if 2 * cost[best] < cost[-1] else longest
+
+
+def sum_rows(index: PaddedRows, weight: PaddedRows, values: jax.Array) -> jax.Array:
+    """sum_n weight[r, n] values[index[r, n]] for every row; `values` [S] or [S, B], weights without B or with it."""
+    total = gather_sum(index.narrow, weight.narrow, values)
+    if index.wide_row.size:
+        total = total.at[index.wide_row].add(gather_sum(index.wide, weight.wide, values))
+    return total
+
+
+def gather_sum(index: jax.Array, weight: jax.Array, values: jax.Array) -> jax.Array:
+    """sum_n weight[..., n] values[index[..., n]], unrolled while n is small.
+
+    Args:
+      index: [..., n].
+      weight: [..., n], or [..., n, B] beside values of shape [S, B].
+      values: [S] or [S, B].
+    """
+    axis = index.ndim - 1
+    if index.shape[-1] > _MAX_UNROLL:
+        values = jnp.asarray(values)
+
+        # A loop over blocks of terms, each one fused pass: the gathered numbers never go through memory.
+        def blocks(array):
+            padding = [(0, 0)] * array.ndim
+            padding[axis] = (0, -index.shape[-1] % _MAX_UNROLL)
+            shape = (*index.shape[:-1], -1, _MAX_UNROLL, *array.shape[axis + 1 :])
+            return jnp.moveaxis(jnp.pad(array, padding).reshape(shape), axis, 0)
+
+        total = jnp.zeros(index.shape[:-1] + values.shape[1:], jnp.result_type(weight, values))
+        return jax.lax.scan(
+            lambda total, block: (total + gather_sum(*block, values), None), total, (blocks(index), blocks(weight))
+        )[0]
+    spread = (..., None) if weight.ndim < axis + values.ndim else ...
+    terms = (jax.lax.index_in_dim(weight, n, axis, keepdims=False) for n in range(index.shape[-1]))
+    return sum(term[spread] * values[index[..., n]] for n, term in enumerate(terms))

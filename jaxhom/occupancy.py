@@ -212,52 +212,44 @@ def _goal(x: jax.Array, b: jax.Array, residual) -> jax.Array:
 
 
 def _bicgstab(system: Callable, b: jax.Array, goal: jax.Array | float) -> jax.Array:
-    """Batched BiCGSTAB (van der Vorst 1992); lanes are the trailing axis and stop one by one.
+    """Batched BiCGSTAB (van der Vorst 1992) from 0; lanes are the trailing axis and stop one by one.
 
-    A lane that breaks down stops where it is; the caller's sweeps take over from there.
+    A lane stops by steps of length 0, which costs nothing, where a choice between old and new arrays would. One that
+    breaks down comes back as 0; the caller's sweeps take over from there.
     """
+    floor = jnp.maximum(0.5 * goal, 4.0 * jnp.finfo(b.dtype).eps * _norm(b))
 
     def dot(u, v):
         return (u * v).sum(axis=0)
 
-    def safe(numerator, denominator):
-        ok = denominator != 0
-        return jnp.where(ok, numerator / jnp.where(ok, denominator, 1.0), 0.0)
+    def ratio(numerator, denominator, active):
+        quotient = numerator / jnp.where(denominator != 0, denominator, 1.0)
+        return jnp.where(active & (denominator != 0) & jnp.isfinite(quotient), quotient, 0.0)
 
     def keep_going(state):
         return jnp.any(state[4]) & (state[-1] < _MAX_KRYLOV_STEPS)
 
     def step(state):
-        x, residual, direction, rho, active, count = state
+        x, residual, direction, rho, active, _, count = state
         product = system(direction)
-        alpha = safe(rho, dot(shadow, product))
+        alpha = ratio(rho, dot(shadow, product), active)
         half = residual - alpha * product
         half_product = system(half)
-        omega = safe(dot(half_product, half), dot(half_product, half_product))
-        new_x = x + alpha * direction + omega * half
-        new_residual = half - omega * half_product
-        new_rho = dot(shadow, new_residual)
-        beta = safe(new_rho, rho) * safe(alpha, omega)
-        new_direction = new_residual + beta * (direction - omega * product)
-        size = _norm(new_residual)
-        finite = jnp.isfinite(size + new_rho + beta)  # a lane that overflowed is out, and stays where it was
-        take = active & finite
-        choose = lambda new, old: jnp.where(take, new, old)  # noqa: E731
-        return (
-            choose(new_x, x),
-            choose(new_residual, residual),
-            choose(new_direction, direction),
-            choose(new_rho, rho),
-            take & (new_rho != 0) & (size > 0.5 * _goal(new_x, b, goal)),
-            count + 1,
-        )
+        omega = ratio(dot(half_product, half), dot(half_product, half_product), active)
+        x = x + alpha * direction + omega * half
+        residual = half - omega * half_product
+        new_rho, size = dot(shadow, residual), _norm(residual)
+        beta = ratio(new_rho, rho, active) * ratio(alpha, omega, active)
+        direction = residual + beta * (direction - omega * product)
+        return x, residual, direction, new_rho, active & (beta != 0) & (size > floor), size, count + 1
 
     # Any fixed dense vector will do. Not b: from a single start state it would see nothing of what moves on.
     shadow = 1.0 + jnp.sin(jnp.arange(len(b), dtype=b.dtype) ** 2)
     shadow = jnp.broadcast_to(shadow.reshape(-1, *(1,) * (b.ndim - 1)), b.shape)
-    rho = dot(shadow, b)
-    active = (rho != 0) & (_norm(b) > 0.5 * _goal(jnp.zeros_like(b), b, goal))
-    return jax.lax.while_loop(keep_going, step, (jnp.zeros_like(b), b, b, rho, active, jnp.zeros((), jnp.int32)))[0]
+    rho, size = dot(shadow, b), _norm(b)
+    start = (jnp.zeros_like(b), b, b, rho, (rho != 0) & (size > floor), size, jnp.zeros((), jnp.int32))
+    x, *_, last, _ = jax.lax.while_loop(keep_going, step, start)
+    return jnp.where(last <= size, x, 0.0)
 
 
 def _sweep_until(sweep: Callable, x: jax.Array, b: jax.Array, discount, residual) -> jax.Array:

@@ -18,7 +18,9 @@ import jax.numpy as jnp
 
 from jaxhom import checks
 from jaxhom.mdp import MDP, expected_next_value, expected_next_values
+from jaxhom.policy_chain import action_chains, saves_gathers
 
+_BLOCK = 8  # sweeps per look at the bounds
 _STALL = 16.0  # a span of this many roundings of the largest value is taken for converged
 
 
@@ -118,41 +120,10 @@ def _reward_batch(mdp: MDP, reward: jax.Array) -> tuple[jax.Array, bool]:
 @functools.partial(jax.jit, static_argnames="max_iterations")
 def _plan(mdp, reward, value, tolerance, *, max_iterations) -> Plan:
     """Batch-last value iteration: reward [S, A, B], value [S, B], tolerance [B]."""
-
-    def action_values(value):
-        return reward + mdp.discount * expected_next_value(mdp, value)
-
-    def best_action_value(value):
-        backups = enumerate(expected_next_values(mdp, value))
-        return functools.reduce(jnp.maximum, [reward[:, a] + mdp.discount * v for a, v in backups])
-
-    def keep_going(state):
-        _, residual, _, count = state
-        return jnp.any(residual > tolerance) & (count < max_iterations)
-
-    def sweep(state):
-        value, residual, iterations, count = state
-        active = residual > tolerance
-        improved = best_action_value(value)
-        low, high = (improved - value).min(axis=0), (improved - value).max(axis=0)
-        # A constant offset has no effect on the span; taking it out at once keeps the values at their scale.
-        centred = improved + mdp.discount / (1.0 - mdp.discount) * 0.5 * (low + high)
-        value = jnp.where(active, centred, value)
-        # A span that rounding alone could make counts as zero: sweeping on would never reduce it.
-        floor = _STALL * jnp.finfo(value.dtype).eps * jnp.abs(improved).max(axis=0)
-        span = jnp.where(high - low > floor, high - low, 0.0)
-        residual = jnp.where(active, 0.5 * span, residual)
-        return value, residual, iterations + active, count + 1
-
-    lanes = reward.shape[-1]
-    start = (
-        value,
-        jnp.full(lanes, jnp.inf, reward.dtype),
-        jnp.zeros(lanes, jnp.int32),
-        jnp.zeros((), jnp.int32),
-    )
-    value, _, iterations, _ = jax.lax.while_loop(keep_going, sweep, start)
-    action_value = action_values(value)
+    lane = 0 if reward.shape[-1] == 1 else slice(None)  # gathers of single numbers, not of rows of one
+    value, iterations = _iterate(mdp, reward[..., lane], value[..., lane], tolerance[lane], max_iterations)
+    value = value.reshape(len(reward), -1)
+    action_value = reward + mdp.discount * expected_next_value(mdp, value)
     difference = action_value.max(axis=1) - value
     low, high = difference.min(axis=0), difference.max(axis=0)
     shift = 0.5 * (low + high) / (1.0 - mdp.discount)
@@ -164,9 +135,53 @@ def _plan(mdp, reward, value, tolerance, *, max_iterations) -> Plan:
         policy=greedy_policy(action_value, tie_tolerance[:, None, None]),
         value=value.T,
         action_value=action_value,
-        iterations=iterations,
+        iterations=iterations.reshape(-1),
         residual=residual,
     )
+
+
+def _iterate(mdp: MDP, reward, value, tolerance, max_iterations) -> tuple[jax.Array, jax.Array]:
+    """Sweeps until half the span of the change is within the tolerance on every lane; value and sweeps per lane.
+
+    The bounds are looked at once per block of sweeps only: two reductions cost more than a sweep.
+    """
+
+    if mdp.is_dense or not saves_gathers(mdp.edges, mdp.narrow_width):
+        expected = functools.partial(expected_next_values, mdp)
+    else:
+        expected = action_chains(mdp.edges, mdp.probability).expected_next_values
+
+    def sweep(_, value):
+        return functools.reduce(jnp.maximum, [reward[:, a] + mdp.discount * v for a, v in enumerate(expected(value))])
+
+    def is_active(residual, count):
+        return (residual > tolerance) & (count < max_iterations)
+
+    def block(state):
+        value, residual, iterations, count = state
+        active = is_active(residual, count)
+        length = jnp.where(count == 0, 1, jnp.minimum(_BLOCK, max_iterations - count))
+        swept = jax.lax.fori_loop(0, length - 1, sweep, value)
+        improved = sweep(None, swept)
+        change = improved - swept
+        low, high = change.min(axis=0), change.max(axis=0)
+        # A constant offset has no effect on the span; taking it out at once keeps the values at their scale.
+        centred = improved + mdp.discount / (1.0 - mdp.discount) * 0.5 * (low + high)
+        # A span that rounding alone could make counts as zero: sweeping on would never reduce it.
+        floor = _STALL * jnp.finfo(value.dtype).eps * jnp.abs(improved).max(axis=0)
+        span = jnp.where(high - low > floor, high - low, 0.0)
+        return (
+            jnp.where(active, centred, value),
+            jnp.where(active, 0.5 * span, residual),
+            iterations + jnp.where(active, length, 0),
+            count + length,
+        )
+
+    lanes = reward.shape[2:]
+    start = (value, jnp.full(lanes, jnp.inf, reward.dtype), jnp.zeros(lanes, jnp.int32), jnp.zeros((), jnp.int32))
+    keep_going = lambda state: jnp.any(is_active(state[1], state[3]))  # noqa: E731
+    value, _, iterations, _ = jax.lax.while_loop(keep_going, block, start)
+    return value, iterations
 
 
 def _tie_rounding(action_value: jax.Array) -> jax.Array:

@@ -1,8 +1,9 @@
-"""The Markov chain that a policy makes of a model: products with P_pi(s, s') = sum_a pi(s, a) T(s, a, s').
+"""Products with a model's transitions, as weights on the edges of its graph.
 
-The edges s -> s' of a model's graph are the same for all policies, and mostly shared by the actions of a state: a
-gridworld has 16 entries (s, a, s') per state but 4 edges. Weights on the edges are made once per policy, and each
-product then reads these alone, forward and backward.
+The edges s -> s' are the same for all policies, and mostly shared by the actions of a state: a gridworld has 16 entries
+(s, a, s') per state but 4 edges. Loops therefore first make weights on the edges, and then read one number per edge:
+for the Markov chain of a policy, P_pi(s, s') = sum_a pi(s, a) T(s, a, s'), forward and backward; for all actions at a
+time, backward, with as many weights per edge as there are actions.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.padded_rows import PaddedRows, pad_rows, sum_rows
+from jaxhom.padded_rows import PaddedRows, gather_sum, pad_rows, sum_rows
 
 
 @jax.tree_util.register_dataclass
@@ -52,6 +53,36 @@ class PolicyChain:
         return sum_rows(self.predecessor, self.predecessor_weight, occupancy)
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ActionChains:
+    """T(s, a, s') for all actions.
+
+    Attributes:
+      successor: int32 [U, S], the first U successors of every state.
+      weight: [A, U, S], their probabilities under each action.
+      wide_row, wide, wide_weight: int32 [J], int32 [J, V] and [A, J, V], what is beyond U; see `PaddedRows`.
+    """
+
+    successor: jax.Array
+    weight: jax.Array
+    wide_row: jax.Array
+    wide: jax.Array
+    wide_weight: jax.Array
+
+    def expected_next_values(self, value: jax.Array) -> list[jax.Array]:
+        """A arrays E[v(s') | s, a], [S] -> [S] or [S, B] -> [S, B]."""
+        spread = (..., None) if value.ndim == 2 else ...
+        gathered = [value[states] for states in self.successor]
+        expected = [
+            sum(weight[spread] * at for weight, at in zip(weights, gathered, strict=True)) for weights in self.weight
+        ]
+        if not self.wide_row.size:
+            return expected
+        beyond = [gather_sum(self.wide, weight, value) for weight in self.wide_weight]
+        return [one.at[self.wide_row].add(more) for one, more in zip(expected, beyond, strict=True)]
+
+
 def find_edges(next_state: np.ndarray, probability: np.ndarray) -> Edges:
     """The edges of successors [S, A, N] without repetitions in a row."""
     num_states, num_actions, slots = next_state.shape
@@ -88,3 +119,31 @@ def policy_chain(edges: Edges, probability: jax.Array, policy: jax.Array) -> Pol
         predecessor=edges.incoming.lookup(source),
         predecessor_weight=edges.incoming.lookup(weight),
     )
+
+
+def action_chains(edges: Edges, probability: jax.Array) -> ActionChains:
+    """The chains of all actions, for probabilities [S, A, N]."""
+    entries = jnp.append(probability.ravel(), jnp.zeros((), probability.dtype))
+    num_actions = edges.entry.shape[1]
+    nothing = jnp.full((1, num_actions), probability.size, edges.entry.dtype)
+    weight = entries[jnp.concatenate([edges.entry, nothing])]
+    rows = edges.outgoing.lookup(weight)
+    target = edges.outgoing.lookup(jnp.append(edges.target, 0))
+    chains = ActionChains(
+        successor=target.narrow.T,
+        weight=jnp.moveaxis(rows.narrow, 0, -1).swapaxes(0, 1),
+        wide_row=target.wide_row,
+        wide=target.wide,
+        wide_weight=jnp.moveaxis(rows.wide, -1, 0),
+    )
+    # Without it XLA would make the weights again in every pass of the caller's loop.
+    return jax.lax.optimization_barrier(chains)
+
+
+def saves_gathers(edges: Edges, narrow_width: int) -> bool:
+    """Whether `ActionChains` beats a pass over `narrow_width` entries per pair: it does where actions share successors.
+
+    A gathered number costs about five times as much as a weight.
+    """
+    num_actions, width = edges.entry.shape[1], edges.outgoing.narrow.shape[1]
+    return width * (1.0 + 0.2 * num_actions) < num_actions * narrow_width

@@ -19,7 +19,8 @@ ROWS = {
     "canonical_forms": -1,  # arrays in, keys out
     "mdp": 0,
     "occupancy": 1,
-    "planning": 1,
+    "planning_sensitivity": 1.1,
+    "planning": 1.2,
     "demonstrations": 1,
     "local_models": 1,
     "lane_queue": 0.5,

@@ -23,8 +23,6 @@ from jaxhom.lpal.certificate import LPALSolution
 from jaxhom.mdp import MDP, push_forward
 from jaxhom.planning import optimal_policy
 
-_PARAMETERS = ("probability", "initial", "features", "discount")  # of the model, beside the expectations
-
 
 def without_tangents(tree):
     """The arrays of a pytree as they are under `jax.grad` or `jax.jvp`; under jit and vmap they stay traced."""
@@ -53,24 +51,22 @@ def with_derivatives(solution: LPALSolution, mdp: MDP, expectations: jax.Array) 
     model = without_tangents(mdp)
     reward = jnp.einsum("sak,bk->bsa", model.features, solution.weights)
     saddle = (solution.occupancy, solution.weights, optimal_policy(model, reward).value)
-    parameters = {name: getattr(mdp, name) for name in _PARAMETERS}
-
-    @jax.custom_jvp
-    def margins(parameters, expectations):
-        return solution.margin, solution.margin_bound
-
-    @margins.defjvp
-    def _(primals, tangents):
-        constant = _only_once(saddle, primals)
-
-        def at(parameters, expectations):
-            return _lagrangian(model.replace(**parameters), expectations, *constant)
-
-        change = jax.jvp(at, primals, tangents)[1]
-        return margins(*primals), (change, change)
-
-    margin, margin_bound = margins(parameters, expectations)
+    margin, margin_bound = _margins(mdp, expectations, solution.margin, solution.margin_bound, saddle)
     return solution.replace(margin=margin, margin_bound=margin_bound)
+
+
+@jax.custom_jvp
+def _margins(mdp, expectations, margin, margin_bound, saddle):
+    del mdp, expectations, saddle
+    return margin, margin_bound
+
+
+@_margins.defjvp
+def _(primals, tangents):
+    mdp, expectations, *_, saddle = primals
+    saddle = _only_once(saddle, mdp, expectations)
+    change = jax.jvp(lambda *inputs: _lagrangian(*inputs, *saddle), primals[:2], tangents[:2])[1]
+    return _margins(*primals), (change, change)
 
 
 @jax.jit
@@ -82,9 +78,9 @@ def _lagrangian(mdp: MDP, expectations, x, weights, value) -> jax.Array:
 
 
 @jax.custom_jvp
-def _only_once(saddle, parameters):
-    """The saddle point at these parameters, whose own derivatives nobody knows."""
-    del parameters
+def _only_once(saddle, mdp, expectations):
+    """The saddle point, which depends on model and expectations in a way that nobody differentiates."""
+    del mdp, expectations
     return saddle
 
 

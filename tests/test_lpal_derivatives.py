@@ -112,7 +112,7 @@ def test_one_vector_of_expectations():
     expectations = here.arrays["expectations"][0]
     solve = functools.partial(lpal, tolerance=TOLERANCE, method="interior_point")
     solution = solve(here.mdp, expectations)
-    for derivative in (jax.grad, jax.jacfwd, jax.jacrev):
+    for derivative in (jax.grad, jax.jacfwd):
         gradient = derivative(lambda expectations: solve(here.mdp, expectations).margin)(expectations)
         np.testing.assert_allclose(gradient, -solution.weights, rtol=0, atol=1e-15)
     value, gradient = jax.value_and_grad(lambda mdp: solve(mdp, expectations).margin, allow_int=True)(here.mdp)

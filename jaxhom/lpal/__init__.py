@@ -21,6 +21,7 @@ from jaxhom.lpal.certificate import LPALSolution
 from jaxhom.lpal.columns import solve_by_columns
 from jaxhom.lpal.flow import solve_by_flow
 from jaxhom.lpal.interior_point import solve_by_interior_point
+from jaxhom.lpal.presolve import reduce_expectations, restore
 from jaxhom.lpal.sensitivity import with_derivatives, without_tangents
 from jaxhom.mdp import MDP, check_policy_shape
 
@@ -79,7 +80,8 @@ def lpal(
     good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features and host.size > 0
     checks.require_shape("expectations", host, f"({mdp.num_features},) or (B, {mdp.num_features})", good)
     host = checks.require_floats("expectations", host)
-    batch = jnp.asarray(np.atleast_2d(host), mdp.dtype)
+    reduction = reduce_expectations(mdp, np.atleast_2d(host))
+    batch = jnp.asarray(reduction.expectations, mdp.dtype)
     if initial_policy is not None:
         initial_policy = checks.as_host_array("initial_policy", initial_policy)
         check_policy_shape(mdp, initial_policy, "initial_policy")
@@ -95,6 +97,7 @@ def lpal(
         raise ValueError(f"tolerance must be positive, got {tolerance}")
     options = {} if max_iterations is None else {"max_iterations": max_iterations}
     solution = _METHODS[method](mdp, batch, initial_policy, tolerance, progress=progress, **options)
+    solution = restore(solution, reduction, tolerance)
     if checks.is_traced(inputs):
         mdp, expectations = inputs
         solution = with_derivatives(solution, mdp, jnp.atleast_2d(jnp.asarray(expectations, mdp.dtype)))

@@ -164,8 +164,13 @@ class MDP:
     def replace(self, **changes) -> "MDP":
         """Returns the model with the given arrays exchanged (unchecked; usable under jit, vmap and grad).
 
-        A new `probability` must keep the zero pattern: successors are not searched for again.
+        A new `probability` must keep the zero pattern: successors are not searched for again. New numbers get the type
+        of those that they replace, so that what was compiled for the model serves the new one too.
         """
+        for name in changes:
+            old = getattr(self, name, None)
+            if hasattr(old, "dtype"):
+                changes[name] = jnp.asarray(changes[name], old.dtype)
         return dataclasses.replace(self, **changes)
 
     @property

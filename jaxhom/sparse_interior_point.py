@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from jaxhom.mdp import MDP
 
 _TO_BOUNDARY = 0.995
-_REGULARISATION = 1e-15  # share of the largest diagonal entry of the normal matrix
+_REGULARISATION = 1e-14  # share of each diagonal entry of the normal matrix
 _REFINEMENTS = 2  # per solve: as z / s spreads, the factorisation alone loses digits
 _PATIENCE = 30  # steps without a smaller error, after which rounding has won
 
@@ -31,7 +31,7 @@ class InteriorPoint:
 
     Attributes:
       z: [m], positive. f: [q]. y: [n], multipliers of the rows. s: [m], positive, c - A^T y up to a residual.
-      error: the largest of z . s and of the residuals' 2-norms, the latter relative to the data.
+      error: the largest of z . s and of what the residuals are worth in the objective, see `_error`.
       iterations: steps taken.
     """
 
@@ -87,7 +87,7 @@ class Rows:
         lower = row >= column
         band = np.zeros((self._bandwidth + 1, self.num_core))
         band[(row - column)[lower], column[lower]] = schur.data[lower]
-        band[0] += _REGULARISATION * band[0].max()
+        band[0] *= 1.0 + _REGULARISATION
         self._factor = scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
         self._behind_free = self._solve_normal(self.free_columns)
         self._free_block = self.free_columns.T @ self._behind_free
@@ -130,7 +130,7 @@ def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_it
     Args:
       rows: A [n, m] and B [n, q].
       cost: c [m]. free_cost: g [q]. right: b [n].
-      tolerance: stop where z . s and the relative residuals are below it.
+      tolerance: stop where `InteriorPoint.error` is below it, in units of the objective.
       max_iterations: steps at most.
 
     Returns:
@@ -142,7 +142,7 @@ def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_it
     point = best = _start(rows, *program)
     for iteration in range(max_iterations):
         residuals = _residuals(rows, *program, point)
-        point = point.replace(error=_error(residuals, point, right, cost), iterations=iteration)
+        point = point.replace(error=_error(residuals, point), iterations=iteration)
         if point.error < best.error:
             best = point
         if best.error <= tolerance or iteration - best.iterations >= _PATIENCE:
@@ -172,10 +172,10 @@ def _residuals(rows: Rows, cost, free_cost, right, point: InteriorPoint):
     return primal, cost - rows.transpose @ point.y - point.s, free_cost - rows.free_columns.T @ point.y
 
 
-def _error(residuals, point: InteriorPoint, right, cost) -> float:
-    primal, dual, free = map(np.linalg.norm, residuals)
-    scale = 1.0 + np.linalg.norm(cost)
-    return float(max(point.z @ point.s, primal / (1.0 + np.linalg.norm(right)), dual / scale, free / scale))
+def _error(residuals, point: InteriorPoint) -> float:
+    """A residual counts with the multiplier, or the variable, that it stands beside: its first-order effect."""
+    effects = zip(residuals, (point.y, point.z, point.f), strict=True)
+    return float(max(point.z @ point.s, *(np.abs(residual) @ np.abs(beside) for residual, beside in effects)))
 
 
 def _step(rows: Rows, residuals, point: InteriorPoint) -> InteriorPoint:

@@ -1,5 +1,6 @@
 """LPAL by the sparse interior-point method: HiGHS on the same program, features up to one per state."""
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +8,7 @@ import oracles
 import pytest
 
 import jaxhom
+from jaxhom import interop
 
 
 @pytest.mark.parametrize("num_regions", [16, 64])
@@ -24,3 +26,14 @@ def test_monte_carlo_expectations(num_regions):
         true = oracles.margin(*arrays, np.asarray(expectations[lane]), np.asarray(solution.policy[lane]))
         assert float(solution.margin[lane]) == pytest.approx(true, abs=1e-7)
     assert (solution.status == jaxhom.Status.SOLVED).all()
+
+
+def test_one_feature_per_state_and_states_that_hardly_occur():
+    """Occupancies of all sizes, and expectations that a policy reaches exactly: rounding must not stop it short."""
+    lake = interop.from_gymnasium(gymnasium.make("FrozenLake-v1"), discount=0.99)
+    mdp = lake.mdp.replace(features=np.repeat(np.eye(16)[:, None], 4, axis=1))
+    expert = jaxhom.optimal_policy(mdp, lake.reward)
+    expectations = jaxhom.feature_expectations(mdp, expert.policy)
+    solution = jaxhom.lpal(mdp, expectations, method="interior_point")
+    assert solution.status == jaxhom.Status.SOLVED
+    assert solution.margin <= 0.0 <= solution.margin_bound  # states add up to a constant: v* = 0

@@ -123,6 +123,23 @@ def test_replace_exchanges_arrays_and_keeps_the_rest():
     assert float(other.discount) == 0.5 and other.probability is mdp.probability
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("discount", [0.5, np.float64(0.5), jnp.asarray(0.5, jnp.float32), np.asarray(0.5)])
+def test_replaced_numbers_have_the_type_of_the_old_ones(dtype, discount):
+    mdp = MDP.from_dense(np.ones((1, 1, 1), dtype), discount=0.9, features=np.ones((1, 2)))
+    other = mdp.replace(discount=discount, initial=[1], features=np.ones((1, 1, 2), int))
+    for name in ("discount", "initial", "features"):
+        assert getattr(other, name).aval == getattr(mdp, name).aval  # weak types would be traced anew
+
+
+def test_replace_serves_descriptions_of_models_and_refuses_unknown_names():
+    """Such as the axes of a vmap, whose leaves are no arrays."""
+    mdp = small_models.case("dense").mdp
+    assert jax.tree.map(lambda _: None, mdp).replace(discount=0).discount == 0
+    with pytest.raises(TypeError, match="reward"):
+        mdp.replace(reward=0.0)
+
+
 def test_model_is_a_pytree_that_passes_through_jit():
     for name in ("dense", "restart"):
         mdp = small_models.case(name).mdp

@@ -244,7 +244,7 @@ def complex_step(case, function, inputs, weight, name, direction):
 @pytest.mark.parametrize(
     ("function", "name"),
     [(feature_expectations, name) for name in SOLVERS]
-    + [(policy_value, name) for name in ("dense", "restart")]
+    + [(policy_value, name) for name in SOLVERS]
     + [(occupancy, "dense")],
 )
 def test_gradients_against_complex_steps(function, name, rng):
@@ -278,10 +278,9 @@ def arguments_of(function):
     return ("policy", "reward") if function is policy_value else ("policy",)
 
 
-@pytest.mark.parametrize("name", ["dense", "restart"])
-def test_forward_and_reverse_mode_on_a_batch(name, rng):
-    """Each lane's derivative along a direction of its own, both ways, against complex steps."""
-    case = small_models.case(name)
+def test_forward_mode_on_a_batch_with_wide_rows(rng):
+    """Each lane's derivative along a direction of its own, against complex steps."""
+    case = small_models.case("restart")
     policies = small_models.random_policy(rng, 2, *case.shape)
     directions, weight = rng.normal(size=policies.shape), rng.normal(size=2)
 
@@ -289,29 +288,53 @@ def test_forward_and_reverse_mode_on_a_batch(name, rng):
         return feature_expectations(case.mdp, policies) @ weight
 
     push = jax.jit(lambda *pair: jax.jvp(weighted, pair[:1], pair[1:])[1])
-    by_forward = push(policies, directions)
     expected = [
         oracles.feature_expectations(*case.arrays, policy + 1j * STEP * direction).imag @ weight / STEP
         for policy, direction in zip(policies, directions, strict=True)
     ]
-    np.testing.assert_allclose(by_forward, expected, rtol=1e-9)
-    if name == "dense":  # the other takes long to compile, and has its gradients tested above
-        gradient = jax.jit(jax.grad(lambda policies: weighted(policies).sum()))(policies)
-        by_reverse = jnp.einsum("bsa,bsa->b", gradient, directions)
-        np.testing.assert_allclose(by_reverse, expected, rtol=1e-9)
+    np.testing.assert_allclose(push(policies, directions), expected, rtol=1e-9)
 
 
-def test_second_derivative_in_the_discount(rng):
-    case = small_models.case("dense")
-    policy, weight = small_models.random_policy(rng, *case.shape), rng.normal(size=2)
+@pytest.mark.parametrize("name", ["sparse", "dense_krylov"])
+def test_second_derivatives_of_a_batch_along_a_line(name, rng):
+    """Two policies and the model move at once; forward over reverse mode, and forward alone, in everything."""
+    case = small_models.case(name)
+    points = {
+        "policy": small_models.random_policy(rng, 2, *case.shape),
+        "probability": np.asarray(case.mdp.probability),
+        "initial": case.initial,
+        "features": case.features,
+        "discount": np.asarray(case.discount),
+    }
+    directions = {key: 1e-2 * rng.normal(size=value.shape) for key, value in points.items()}
+    directions["probability"] *= points["probability"] > 0
+    weight = rng.normal(size=(2, 2))
 
-    def weighted(discount):
-        return feature_expectations(case.mdp.replace(discount=discount), policy) @ weight
+    def weighted(inputs):
+        inputs = dict(inputs)
+        policy = inputs.pop("policy")
+        return jnp.vdot(weight, feature_expectations(case.mdp.replace(**inputs), policy))
 
-    derivative = jax.jit(jax.grad(weighted))
-    second = jax.jit(jax.grad(derivative))(case.discount)
-    first = [float(derivative(case.discount + h)) for h in (-1e-5, 1e-5)]
-    np.testing.assert_allclose(second, (first[1] - first[0]) / 2e-5, rtol=1e-6)
+    def first(share):
+        """The oracle's derivative at `share` of the directions."""
+        moved = {
+            key: (case.transition if key == "probability" else value)
+            + (share + 1j * STEP) * along(case.mdp, key, directions[key])
+            for key, value in points.items()
+        }
+        model = [moved[key] for key in ("probability", "discount", "initial", "features")]
+        lanes = [oracles.feature_expectations(*model, policy).imag for policy in moved["policy"]]
+        return np.vdot(weight, lanes) / STEP
+
+    @jax.jit
+    def derivatives(points):
+        change, second = jax.jvp(jax.grad(weighted), (points,), (directions,))
+        by_reverse, curvature = (sum(jnp.vdot(a[key], directions[key]) for key in directions) for a in (change, second))
+        return by_reverse, jax.jvp(weighted, (points,), (directions,))[1], curvature
+
+    by_reverse, by_forward, curvature = derivatives(points)
+    np.testing.assert_allclose([by_reverse, by_forward], first(0.0), rtol=1e-9)
+    np.testing.assert_allclose(curvature, (first(1e-4) - first(-1e-4)) / 2e-4, rtol=1e-5)
 
 
 # ---------------------------------------------------------------------------------- what is refused

@@ -9,7 +9,7 @@ margin v is worth at least the expert's value plus v times the sum of the weight
 
 `columns` plays the game over policies, `flow` runs PDHG on the linear program itself, `interior_point` a sparse
 interior-point method on the same; all end in `certificate`, which computes the true margin of the policy that is
-returned and the best upper bound.
+returned and the best upper bound. `sensitivity` gives the margin its derivatives.
 """
 
 import jax
@@ -21,6 +21,8 @@ from jaxhom.lpal.certificate import LPALSolution
 from jaxhom.lpal.columns import solve_by_columns
 from jaxhom.lpal.flow import solve_by_flow
 from jaxhom.lpal.interior_point import solve_by_interior_point
+from jaxhom.lpal.presolve import reduce_expectations, restore
+from jaxhom.lpal.sensitivity import with_derivatives, without_tangents
 from jaxhom.mdp import MDP, check_policy_shape
 
 _METHODS = {"columns": solve_by_columns, "flow": solve_by_flow, "interior_point": solve_by_interior_point}
@@ -56,10 +58,13 @@ def lpal(
 
     Returns:
       `LPALSolution`, with a leading axis [B] if the expectations have one. Its bounds hold whatever the status.
+      Under `jax.grad` and `jax.jvp`, but not under jit or vmap, `margin` and `margin_bound` have the derivative of the
+      best margin with respect to expectations and to the model's probability, initial, features and discount
+      (`jaxhom.lpal.sensitivity`). Policy, occupancy and weights are constants there.
 
     Raises:
       ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
-        distributions, a model without features, an unknown method.
+        distributions, a model without features, an unknown method; under jit or vmap; on second derivatives.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
     """
@@ -67,13 +72,16 @@ def lpal(
         raise ValueError(f"method must be one of {tuple(_METHODS)}, got {method!r}")
     if not mdp.num_features:
         raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+    inputs = (mdp, expectations)
+    mdp, expectations, initial_policy = without_tangents((mdp, expectations, initial_policy))
     if checks.is_traced(mdp, expectations, initial_policy):
-        raise ValueError("lpal adds columns on the host: call it outside jit, vmap and grad, in batches [B, K]")
+        raise ValueError("lpal adds columns on the host: call it outside jit and vmap, in batches [B, K]")
     host = checks.as_host_array("expectations", expectations)
     good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features and host.size > 0
     checks.require_shape("expectations", host, f"({mdp.num_features},) or (B, {mdp.num_features})", good)
     host = checks.require_floats("expectations", host)
-    batch = jnp.asarray(np.atleast_2d(host), mdp.dtype)
+    reduction = reduce_expectations(mdp, np.atleast_2d(host))
+    batch = jnp.asarray(reduction.expectations, mdp.dtype)
     if initial_policy is not None:
         initial_policy = checks.as_host_array("initial_policy", initial_policy)
         check_policy_shape(mdp, initial_policy, "initial_policy")
@@ -89,4 +97,8 @@ def lpal(
         raise ValueError(f"tolerance must be positive, got {tolerance}")
     options = {} if max_iterations is None else {"max_iterations": max_iterations}
     solution = _METHODS[method](mdp, batch, initial_policy, tolerance, progress=progress, **options)
+    solution = restore(solution, reduction, tolerance)
+    if checks.is_traced(inputs):
+        mdp, expectations = inputs
+        solution = with_derivatives(solution, mdp, jnp.atleast_2d(jnp.asarray(expectations, mdp.dtype)))
     return solution if host.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], solution)

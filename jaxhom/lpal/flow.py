@@ -24,7 +24,7 @@ from jaxhom.pdhg.flow_lp import FlowProblem
 
 _STEPS_PER_CERTIFICATE = 16  # of engine.STEPS_PER_CHECK iterations each
 _FIRST_WEIGHT = 0.1
-_WEIGHT_RANGE = (1 / 3, 10.0)  # times the ratio of the dual to the primal point's length
+_WEIGHT_RANGE = (0.01, 3.0)  # times the ratio of the dual to the primal point's length
 _CLEAR_LOSSES = (float("inf"), 1e-2, 1e-4)  # an action that loses more than this share of the largest reward is left out
 
 

@@ -25,7 +25,11 @@ from jaxhom.pdhg.flow_lp import FlowProblem
 _STEPS_PER_CERTIFICATE = 16  # of engine.STEPS_PER_CHECK iterations each
 _FIRST_WEIGHT = 0.1
 _WEIGHT_RANGE = (0.01, 3.0)  # times the ratio of the dual to the primal point's length
-_CLEAR_LOSSES = (float("inf"), 1e-2, 1e-4)  # an action that loses more than this share of the largest reward is left out
+_CLEAR_LOSSES = (
+    float("inf"),
+    1e-2,
+    1e-4,
+)  # an action that loses more than this share of the largest reward is left out
 
 
 def solve_by_flow(
@@ -39,6 +43,9 @@ def solve_by_flow(
 ) -> LPALSolution:
     """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None."""
     problem = _make_problem(mdp, expectations)
+    if initial_policy is None:
+        shape = (len(expectations), mdp.num_states, mdp.num_actions)
+        initial_policy = jnp.full(shape, 1.0 / mdp.num_actions, mdp.dtype)
     state = _start(problem, initial_policy)
     bound = best = None
     value = jnp.zeros((len(expectations), mdp.num_states), mdp.dtype)
@@ -67,12 +74,10 @@ def _make_problem(mdp: MDP, expectations: jax.Array) -> FlowProblem:
 
 
 @jax.jit
-def _start(problem: FlowProblem, initial_policy: jax.Array | None) -> engine.PDHGState:
-    primal, dual = problem.start()
-    if initial_policy is not None:
-        x = occupancy(problem.mdp, initial_policy) * (1.0 - problem.mdp.discount)
-        dual = problem.dual_of(jnp.moveaxis(x, 0, -1))
-    state = engine.init(problem, (primal, dual))
+def _start(problem: FlowProblem, initial_policy: jax.Array) -> engine.PDHGState:
+    primal, _ = problem.start()
+    x = occupancy(problem.mdp, initial_policy) * (1.0 - problem.mdp.discount)
+    state = engine.init(problem, (primal, problem.dual_of(jnp.moveaxis(x, 0, -1))))
     return state.replace(weight=jnp.full_like(state.weight, _FIRST_WEIGHT))
 
 

@@ -35,10 +35,8 @@ def factor_flow(mdp: MDP, features: np.ndarray) -> FlowProjection:
     normal, cross = scipy.sparse.csr_array(flow @ flow.T), flow @ phi
     order, size = _order_in_blocks(normal)
     lower, diagonal = _factor_blocks(normal[order][:, order], size)
-    if len(diagonal) == 1:
-        behind = diagonal[0] @ cross
-    else:
-        behind = scipy.sparse.linalg.splu(normal.tocsc()).solve(cross)
+    is_whole = len(diagonal) == 1
+    behind = diagonal[0] @ cross if is_whole else scipy.sparse.linalg.splu(normal.tocsc()).solve(cross)
     schur = phi.T @ phi + FEATURE_SCALE**2 * np.eye(phi.shape[1]) - cross.T @ behind
     padding = np.full(len(diagonal) * size - len(order), mdp.num_states)
     arrays = {"lower": lower, "diagonal": diagonal, "behind": behind, "schur": np.linalg.inv(schur)}
@@ -57,10 +55,10 @@ def _order_in_blocks(normal: scipy.sparse.csr_array) -> tuple[np.ndarray, int]:
     size = max(int(np.abs(place[pattern.row] - place[pattern.col]).max()), 1)
     if _MIN_BLOCKS * size > num_states:
         order, size = np.arange(num_states), num_states
-    blocks = -(-num_states // size)
-    if 2 * blocks * size**2 > _MAX_ENTRIES:
+    entries = 2 * -(-num_states // size) * size**2
+    if entries > _MAX_ENTRIES:
         raise ValueError(
-            f"method='flow' needs a factor of {2 * blocks * size**2:.1e} entries for this model of {num_states} states, "
+            f"method='flow' needs a factor of {entries:.1e} entries for this model of {num_states} states, "
             f"more than {_MAX_ENTRIES:.1e}: use method='columns'"
         )
     return order, size

@@ -1,14 +1,14 @@
 """LPAL's linear program over occupancies as a saddle-point problem, lanes last, with exact projections on the flow.
 
-Maximise min_i (Phi^T x - Vhat)_i over occupancies: x on the Bellman flow F x = alpha (Boularias and Chaib-draa 2010,
-eqs. 3-4), x >= 0. As a saddle point between the constraints that are simple and the affine set on which the others hold,
+Maximise min_i (Phi^T x - Vhat)_i over occupancies: x >= 0 on the Bellman flow F x = alpha (Boularias and Chaib-draa
+2010, eqs. 3-4). As a saddle point between the simple constraints and the affine set on which the others hold,
 
     min_{lambda >= 0, q in s simplex}  max_{(x, u) in A}  lambda . x + q . (u - Vhat / s),
     A = {(x, u): F x = alpha, s u = Phi^T x},
 
-with multipliers lambda of x >= 0 and q = s w, w the weights of the upper bound. The coupling is the identity, so PDHG on
-it is Douglas-Rachford splitting and its step length 1 whatever the discount: that F is nearly singular for discounts
-near 1 only concerns the projection on A, which is exact (`FlowProjection`).
+with multipliers lambda of x >= 0 and q = s w, w the weights of the upper bound. The coupling is the identity, so PDHG
+on it is Douglas-Rachford splitting (O'Connor and Vandenberghe 2020), its step length 1 whatever the discount: that F is
+nearly singular for discounts near 1 only concerns the projection on A, which is exact (`FlowProjection`).
 
 Features are scaled to at most 1 and x to sum 1. The primal point is lambda and q stacked, [S A + K, lanes], the dual
 one x and u.
@@ -95,12 +95,12 @@ class FlowProblem:
     def start(self) -> tuple[jax.Array, jax.Array]:
         """No multipliers, uniform weights; the point of the affine set next to the uniform x."""
         (num_features, lanes), pairs = self.expectations.shape, self.mdp.num_states * self.mdp.num_actions
-        q = jnp.full((num_features, lanes), FEATURE_SCALE / num_features, self.mdp.dtype)
         x = jnp.full((self.mdp.num_states, self.mdp.num_actions, lanes), 1.0 / pairs, self.mdp.dtype)
+        q = jnp.full((num_features, lanes), FEATURE_SCALE / num_features, x.dtype)
         return jnp.concatenate([jnp.zeros((pairs, lanes), x.dtype), q]), self.project_dual(self.dual_of(x), None)
 
     def dual_of(self, x: jax.Array) -> jax.Array:
-        """The dual point of x [S, A, lanes]."""
+        """The dual point of x [S, A, lanes], on the affine set if x is on the flow."""
         return jnp.concatenate([x.reshape(-1, x.shape[-1]), self._expected(x) / FEATURE_SCALE])
 
     def forward(self, primal: jax.Array) -> jax.Array:

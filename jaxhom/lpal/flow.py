@@ -8,8 +8,6 @@ read off the occupancies (eq. 5) and their true margins computed, the weights ar
 ends when those two meet.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,7 +90,7 @@ def _advance(problem: FlowProblem, state: engine.PDHGState) -> engine.PDHGState:
     return jax.lax.fori_loop(0, _STEPS_PER_CERTIFICATE, step, state)
 
 
-@functools.partial(jax.jit, static_argnames="tolerance")
+@jax.jit
 def _certify(problem, expectations, state, bound: UpperBound | None, value, tolerance, iterations):
     """The best bound so far, the value function of the newest weights, and the best policy that the state suggests."""
     mdp = problem.mdp

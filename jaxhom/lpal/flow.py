@@ -3,9 +3,9 @@
 I - gamma T is ill-conditioned for discounts near 1, and a first-order method that only multiplies by it crawls. Here
 every iteration projects exactly on the flow, by a factorisation that is made once and shared by all lanes
 (`flow_factor`), and PDHG with restarts and a primal weight (`pdhg.engine`) is left with x >= 0 and the features: a few
-thousand iterations. It shares nothing with the columns but the certificate. Every few hundred iterations policies are
-read off the occupancies (eq. 5) and their true margins computed, the weights are bounded by planning, and the loop
-ends when those two meet.
+thousand iterations, more where occupancies spread over thousands of states without any constraint to pin them down. It
+shares nothing with the columns but the certificate. Every few hundred iterations policies are read off the occupancies
+(eq. 5) and their true margins computed, the weights are bounded by planning, and the loop ends when those two meet.
 """
 
 import jax
@@ -23,11 +23,8 @@ from jaxhom.pdhg.flow_lp import FlowProblem
 _STEPS_PER_CERTIFICATE = 16  # of engine.STEPS_PER_CHECK iterations each
 _FIRST_WEIGHT = 0.1
 _WEIGHT_RANGE = (0.01, 3.0)  # times the ratio of the dual to the primal point's length
-_CLEAR_LOSSES = (
-    float("inf"),
-    1e-2,
-    1e-4,
-)  # an action that loses more than this share of the largest reward is left out
+# An action that loses more than this share of the largest reward is left out of a policy.
+_CLEAR_LOSSES = (float("inf"), 1e-2, 1e-4)
 
 
 def solve_by_flow(

@@ -51,8 +51,8 @@ def lpal(
         is a narrow band (grids), one lane at a time; or "flow" for PDHG on the linear program with exact projections
         on the flow, all lanes at once: an independent second opinion, slower, for models whose graph is a narrow band
         or that have up to a few thousand states.
-      max_iterations: columns (default 500), interior-point steps (100) or PDHG iterations (20,000; one to seven thousand
-        are usual) after which to stop; `status` tells.
+      max_iterations: columns (default 500), interior-point steps (100) or PDHG iterations (20,000; one to seven
+        thousand are usual) after which to stop; `status` tells.
       progress: show a progress bar of the largest gap.
 
     Returns:

@@ -7,9 +7,10 @@ Given expectations Vhat of the expert's features, find the policy with the large
 (Boularias and Chaib-draa 2010, eqs. 2-5). Rewards are non-negative combinations of the features, so a policy of
 margin v is worth at least the expert's value plus v times the sum of the weights.
 
-`columns` plays the game over policies, `flow` runs PDHG on the linear program itself, `interior_point` a sparse
-interior-point method on the same; all end in `certificate`, which computes the true margin of the policy that is
-returned and the best upper bound. `sensitivity` gives the margin its derivatives.
+`columns` plays the game over policies, `flow` runs PDHG on the linear program itself (`flow_factor` prepares its
+projection on the flow), `interior_point` a sparse interior-point method on the same; all end in `certificate`, which
+computes the true margin of the policy that is returned and the best upper bound. `presolve` takes out what no policy
+can reach, `sensitivity` gives the margin its derivatives.
 """
 
 import jax
@@ -50,10 +51,11 @@ def lpal(
       tolerance: largest certified gap margin_bound - margin to settle for; by default
         1e-5 / (1 - discount) times the largest |feature|.
       method: "columns"; "interior_point", far faster where features are many and do not overlap, on models whose graph
-        is a narrow band (grids), one lane at a time; or "flow" for PDHG on the linear program: slower, an independent
-        second opinion.
-      max_iterations: columns (default 500), interior-point steps (100) or PDHG iterations (20,000) after which to
-        stop; `status` tells.
+        is a narrow band (grids), one lane at a time; or "flow" for PDHG on the linear program with exact projections
+        on the flow, all lanes at once: an independent second opinion, slower, for models whose graph is a narrow band
+        or that have up to a few thousand states.
+      max_iterations: columns (default 500), interior-point steps (100) or PDHG iterations (20,000; one to seven
+        thousand are usual) after which to stop; `status` tells.
       progress: show a progress bar of the largest gap.
 
     Returns:
@@ -64,7 +66,8 @@ def lpal(
 
     Raises:
       ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
-        distributions, a model without features, an unknown method; under jit or vmap; on second derivatives.
+        distributions, a model without features, an unknown method, a model too large for method "flow"; under jit or
+        vmap; on second derivatives.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
     """

@@ -1,22 +1,30 @@
 """LPAL on the flow constraints: PDHG on the linear program (2)-(4) itself.
 
-I - gamma T is ill-conditioned for discounts near 1, and a first-order method on it crawls. It is kept as a second
-opinion that shares nothing with the columns but the certificate: every few hundred iterations the policy is read off
-the occupancy (eq. 5) and its true margin computed, the weights are bounded by planning, and the loop ends when those
-two meet.
+I - gamma T is ill-conditioned for discounts near 1, and a first-order method that only multiplies by it crawls. Here
+every iteration projects exactly on the flow, by a factorisation that is made once and shared by all lanes
+(`flow_factor`), and PDHG with restarts and a primal weight (`pdhg.engine`) is left with x >= 0 and the features: a few
+thousand iterations, more where occupancies spread over thousands of states without any constraint to pin them down. It
+shares nothing with the columns but the certificate. Every few hundred iterations policies are read off the occupancies
+(eq. 5) and their true margins computed, the weights are bounded by planning, and the loop ends when those two meet.
 """
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from tqdm import tqdm
 
-from jaxhom.lpal.certificate import LPALSolution, better_bound, bound_by_planning, certify
+from jaxhom.lpal.certificate import LPALSolution, UpperBound, better_bound, bound_by_planning, certify
+from jaxhom.lpal.flow_factor import factor_flow
 from jaxhom.mdp import MDP
 from jaxhom.occupancy import occupancy
 from jaxhom.pdhg import Status, engine
 from jaxhom.pdhg.flow_lp import FlowProblem
 
-_STEPS_PER_CERTIFICATE = 50  # of engine.STEPS_PER_CHECK iterations each
+_STEPS_PER_CERTIFICATE = 16  # of engine.STEPS_PER_CHECK iterations each
+_FIRST_WEIGHT = 0.1
+_WEIGHT_RANGE = (0.01, 3.0)  # times the ratio of the dual to the primal point's length
+# An action that loses more than this share of the largest reward is left out of a policy.
+_CLEAR_LOSSES = (float("inf"), 1e-2, 1e-4)
 
 
 def solve_by_flow(
@@ -29,21 +37,18 @@ def solve_by_flow(
     progress: bool = False,
 ) -> LPALSolution:
     """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None."""
-    problem = FlowProblem(mdp=mdp, expectations=(1.0 - mdp.discount) * expectations.T)
+    problem = _make_problem(mdp, expectations)
+    if initial_policy is None:
+        shape = (len(expectations), mdp.num_states, mdp.num_actions)
+        initial_policy = jnp.full(shape, 1.0 / mdp.num_actions, mdp.dtype)
     state = _start(problem, initial_policy)
     bound = best = None
     value = jnp.zeros((len(expectations), mdp.num_states), mdp.dtype)
     done = 0
     with tqdm(disable=not progress, desc="LPAL", unit="iteration", total=max_iterations) as bar:
         while True:
-            weights = state.primal[: mdp.num_features].T
-            weights = jnp.maximum(weights, 0.0) / jnp.maximum(weights, 0.0).sum(axis=1, keepdims=True)
-            new_bound, plan = bound_by_planning(mdp, expectations, weights, value, tolerance)
-            value = plan.value
-            bound = new_bound if bound is None else better_bound(bound, new_bound)
-            x = jnp.moveaxis(state.dual, -1, 0) / (1.0 - mdp.discount)
-            solution = certify(mdp, expectations, x, bound, tolerance, done, stopped=Status.ITERATION_LIMIT)
-            best = solution if best is None else _better(best, solution, bound, tolerance)
+            bound, value, solution = _certify(problem, expectations, state, bound, value, tolerance, done)
+            best = solution if best is None else _better(best, solution, tolerance)
             bar.set_postfix(gap=f"{float((best.margin_bound - best.margin).max()):.2e}")
             if (best.status == Status.SOLVED).all() or done >= max_iterations:
                 return best
@@ -52,22 +57,59 @@ def solve_by_flow(
             bar.update(_STEPS_PER_CERTIFICATE * engine.STEPS_PER_CHECK)
 
 
+def _make_problem(mdp: MDP, expectations: jax.Array) -> FlowProblem:
+    features = np.asarray(mdp.features)
+    scale = np.abs(features).max() or 1.0
+    scaled = features / scale
+    projection = factor_flow(mdp, scaled)
+    if (features == features[:, :1]).all():
+        scaled = scaled[:, :1]
+    expected = (1.0 - mdp.discount) / scale * expectations.T
+    return FlowProblem(mdp=mdp, features=jnp.asarray(scaled), expectations=expected, projection=projection)
+
+
 @jax.jit
-def _start(problem: FlowProblem, initial_policy: jax.Array | None) -> engine.PDHGState:
-    primal, dual = problem.start()
-    if initial_policy is not None:
-        x = occupancy(problem.mdp, initial_policy) * (1.0 - problem.mdp.discount)
-        dual = jnp.moveaxis(x, 0, -1)
-    return engine.init(problem, (primal, dual))
+def _start(problem: FlowProblem, initial_policy: jax.Array) -> engine.PDHGState:
+    primal, _ = problem.start()
+    x = occupancy(problem.mdp, initial_policy) * (1.0 - problem.mdp.discount)
+    state = engine.init(problem, (primal, problem.dual_of(jnp.moveaxis(x, 0, -1))))
+    return state.replace(weight=jnp.full_like(state.weight, _FIRST_WEIGHT))
 
 
 @jax.jit
 def _advance(problem: FlowProblem, state: engine.PDHGState) -> engine.PDHGState:
-    return jax.lax.fori_loop(0, _STEPS_PER_CERTIFICATE, lambda _, s: engine.step(problem, s), state)
+    def step(_, state):
+        state = engine.step(problem, state)
+        # Where one side has arrived, the engine's rule gives all weight to the other and never takes it back.
+        ratio = jnp.linalg.norm(state.dual, axis=0) / jnp.linalg.norm(state.primal, axis=0)
+        return state.replace(weight=jnp.clip(state.weight, *(ratio * factor for factor in _WEIGHT_RANGE)))
+
+    return jax.lax.fori_loop(0, _STEPS_PER_CERTIFICATE, step, state)
 
 
 @jax.jit
-def _better(one: LPALSolution, other: LPALSolution, bound, tolerance) -> LPALSolution:
+def _certify(problem, expectations, state, bound: UpperBound | None, value, tolerance, iterations):
+    """The best bound so far, the value function of the newest weights, and the best policy that the state suggests."""
+    mdp = problem.mdp
+    new_bound, plan = bound_by_planning(mdp, expectations, problem.weights(state.primal).T, value, tolerance)
+    bound = new_bound if bound is None else better_bound(bound, new_bound)
+    loss = plan.action_value.max(axis=-1, keepdims=True) - plan.action_value
+    scale = jnp.abs(mdp.features).max()
+    readings = problem.occupancies(state.primal, state.dual, state.weight)
+    readings = [jnp.moveaxis(x, -1, 0) / (1.0 - mdp.discount) for x in readings]
+    candidates = [jnp.zeros_like(loss)]  # nothing is left: the plan's own policy
+    candidates += [jnp.where(loss <= share * scale, x, 0.0) for x in readings for share in _CLEAR_LOSSES]
+    count, lanes = len(candidates), len(expectations)
+    repeated, of_all = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * count), (expectations, bound))
+    x = jnp.concatenate(candidates)
+    solution = certify(mdp, repeated, x, of_all, tolerance, iterations, stopped=Status.ITERATION_LIMIT)
+    solution = jax.tree.map(lambda leaf: leaf.reshape(count, lanes, *leaf.shape[1:]), solution)
+    best = solution.margin.argmax(axis=0)
+    return bound, plan.value, jax.tree.map(lambda leaf: leaf[best, jnp.arange(lanes)], solution)
+
+
+@jax.jit
+def _better(one: LPALSolution, other: LPALSolution, tolerance) -> LPALSolution:
     """Lane by lane the larger margin, with the newest bound; lanes that were solved stay as they are."""
     take = (other.margin > one.margin) & (one.status != Status.SOLVED)
 
@@ -75,10 +117,10 @@ def _better(one: LPALSolution, other: LPALSolution, bound, tolerance) -> LPALSol
         return jnp.where(take.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
     best = jax.tree.map(choose, one, other)
-    is_closed = bound.margin_bound - best.margin <= tolerance
+    is_closed = other.margin_bound - best.margin <= tolerance
     return best.replace(
-        margin_bound=bound.margin_bound,
-        weights=bound.weights,
+        margin_bound=other.margin_bound,
+        weights=other.weights,
         iterations=jnp.where(one.status == Status.SOLVED, one.iterations, other.iterations),
         status=jnp.where(is_closed, Status.SOLVED, Status.ITERATION_LIMIT).astype(jnp.int32),
     )

@@ -1,14 +1,17 @@
-"""LPAL's linear program over occupancies as a saddle-point problem, lanes last.
+"""LPAL's linear program over occupancies as a saddle-point problem, lanes last, with exact projections on the flow.
 
-    min_{w in simplex, h in box} max_{x in X}  w . (Phi^T x - Vhat) + h . (alpha - (E - gamma T)^T x),
+Maximise min_i (Phi^T x - Vhat)_i over occupancies: x >= 0 on the Bellman flow F x = alpha (Boularias and Chaib-draa
+2010, eqs. 3-4). As a saddle point between the simple constraints and the affine set on which the others hold,
 
-with X = {x >= 0, sum x = 1 / (1 - gamma)}, which the Bellman flow (3)-(4) of Boularias and Chaib-draa 2010 implies,
-and h, the multipliers of the flow, in the box of values that rewards Phi w can have. Both restrictions leave the
-value alone and make every point a certificate: with the other side's best answer in closed form, any (w, h) is an
-upper and any x a lower bound.
+    min_{lambda >= 0, q in s simplex}  max_{(x, u) in A}  lambda . x + q . (u - Vhat / s),
+    A = {(x, u): F x = alpha, s u = Phi^T x},
 
-Inside, x is scaled to sum 1, h to the unit of features (divided by 1 - gamma where it acts). The primal point is
-w and h stacked, [K + S, lanes]; the dual is x, [S, A, lanes].
+with multipliers lambda of x >= 0 and q = s w, w the weights of the upper bound. The coupling is the identity, so PDHG
+on it is Douglas-Rachford splitting (O'Connor and Vandenberghe 2020), its step length 1 whatever the discount: that F is
+nearly singular for discounts near 1 only concerns the projection on A, which is exact (`FlowProjection`).
+
+Features are scaled to at most 1 and x to sum 1. The primal point is lambda and q stacked, [S A + K, lanes], the dual
+one x and u.
 """
 
 import chex
@@ -18,74 +21,144 @@ import jax.numpy as jnp
 from jaxhom.mdp import MDP, expected_next_values, push_forward
 from jaxhom.pdhg.projections import project_simplex
 
+FEATURE_SCALE = 3.0  # s: a step moves weights by 1 / s^2 of what it moves multipliers of x >= 0
+
+
+@chex.dataclass(frozen=True)
+class FlowProjection:
+    """(M M^T)^-1 of the rows M = [F, 0; Phi^T, -s] of the affine set, by blocks, for products with many lanes.
+
+    F F^T is block tridiagonal in a suitable order of the states, with nb blocks of n (one block: dense). The K feature
+    rows are eliminated last.
+
+    Attributes:
+      order: int32 [nb n], the state at each place of the order; S, a row of zeros, on padding.
+      place: int32 [S], the place of each state.
+      lower: [nb, n, n], the block left of the diagonal in the block Cholesky factor with unit diagonal; 0 in the first.
+      diagonal: [nb, n, n], inverses of the factor's diagonal blocks.
+      behind: [S, K], (F F^T)^-1 F Phi.
+      schur: [K, K], inverse of the feature rows' Schur complement.
+    """
+
+    order: jax.Array
+    place: jax.Array
+    lower: jax.Array
+    diagonal: jax.Array
+    behind: jax.Array
+    schur: jax.Array
+
+    def solve(self, flow: jax.Array, expected: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(M M^T)^-1 of a right-hand side [S, lanes], [K, lanes]."""
+        on_features = self.schur @ (expected - self.behind.T @ flow)
+        return self._solve_flow(flow) - self.behind @ on_features, on_features
+
+    def _solve_flow(self, right: jax.Array) -> jax.Array:
+        """(F F^T)^-1 right, [S, lanes]: forwards and backwards over the blocks."""
+        count, size, _ = self.diagonal.shape
+        if count == 1:
+            return self.diagonal[0] @ right
+        right = jnp.concatenate([right, jnp.zeros_like(right[:1])])[self.order].reshape(count, size, -1)
+
+        def forwards(before, block):
+            lower, right = block
+            reduced = right - lower @ before
+            return reduced, reduced
+
+        def backwards(behind, block):
+            below, diagonal, reduced = block
+            solution = diagonal @ reduced - below.T @ behind
+            return solution, solution
+
+        zeros = jnp.zeros_like(right[0])
+        _, reduced = jax.lax.scan(forwards, zeros, (self.lower, right))
+        below = jnp.roll(self.lower, -1, axis=0)  # that of the last block is 0
+        _, solution = jax.lax.scan(backwards, zeros, (below, self.diagonal, reduced), reverse=True)
+        return solution.reshape(count * size, -1)[self.place]
+
 
 @chex.dataclass(frozen=True)
 class FlowProblem:
     """A batch of programs over one model.
 
     Attributes:
-      mdp: the model, features [S, A, K].
-      expectations: [K, lanes], (1 - gamma) Vhat.
+      mdp: the model.
+      features: [S, A, K], or [S, 1, K] where they are those of the state alone; largest entry 1.
+      expectations: [K, lanes], (1 - gamma) Vhat in the unit of `features`.
+      projection: the factorisation for these features.
     """
 
     mdp: MDP
+    features: jax.Array
     expectations: jax.Array
+    projection: FlowProjection
 
     def start(self) -> tuple[jax.Array, jax.Array]:
-        """Uniform w, h in the middle of its box, uniform x."""
-        mdp, lanes = self.mdp, self.expectations.shape[-1]
-        w = jnp.full((mdp.num_features, lanes), 1.0 / mdp.num_features, mdp.dtype)
-        h = jnp.full((mdp.num_states, lanes), sum(self._box()) / 2, mdp.dtype)
-        pairs = mdp.num_states * mdp.num_actions
-        x = jnp.full((mdp.num_states, mdp.num_actions, lanes), 1.0 / pairs, mdp.dtype)
-        return jnp.concatenate([w, h]), x
+        """No multipliers, uniform weights; the point of the affine set next to the uniform x."""
+        (num_features, lanes), pairs = self.expectations.shape, self.mdp.num_states * self.mdp.num_actions
+        x = jnp.full((self.mdp.num_states, self.mdp.num_actions, lanes), 1.0 / pairs, self.mdp.dtype)
+        q = jnp.full((num_features, lanes), FEATURE_SCALE / num_features, x.dtype)
+        return jnp.concatenate([jnp.zeros((pairs, lanes), x.dtype), q]), self.project_dual(self.dual_of(x), None)
+
+    def dual_of(self, x: jax.Array) -> jax.Array:
+        """The dual point of x [S, A, lanes], on the affine set if x is on the flow."""
+        return jnp.concatenate([x.reshape(-1, x.shape[-1]), self._expected(x) / FEATURE_SCALE])
 
     def forward(self, primal: jax.Array) -> jax.Array:
-        """Phi w + (gamma T h - h) / (1 - gamma), [K + S, lanes] -> [S, A, lanes]."""
-        mdp = self.mdp
-        w, h = self._split(primal)
-        advantage = jnp.stack([mdp.discount * v - h for v in expected_next_values(mdp, h)], axis=1)
-        return jnp.einsum("sak,kb->sab", mdp.features, w) + advantage / (1.0 - mdp.discount)
+        """The identity."""
+        return primal
 
-    def adjoint(self, x: jax.Array) -> jax.Array:
-        """Phi^T x stacked on (gamma T^T x - E^T x) / (1 - gamma), [S, A, lanes] -> [K + S, lanes]."""
-        mdp = self.mdp
-        arriving = mdp.discount * push_forward(mdp, x) - x.sum(axis=1)
-        expected = jnp.einsum("sak,sab->kb", mdp.features, x)
-        return jnp.concatenate([expected, arriving / (1.0 - mdp.discount)])
+    def adjoint(self, dual: jax.Array) -> jax.Array:
+        """The identity."""
+        return dual
 
     def project_primal(self, point: jax.Array, step: jax.Array) -> jax.Array:
-        """The step on the linear term -Vhat . w + alpha . h, then w onto the simplex and h into its box."""
-        point = point - step * self._linear()
-        w, h = self._split(point)
-        return jnp.concatenate([project_simplex(w), jnp.clip(h, *self._box())])
+        """lambda >= 0; the step on the linear term -q . Vhat / s, then q onto the simplex of sum s."""
+        multipliers, q = self._split(point)
+        q = project_simplex(q + step * (self.expectations / FEATURE_SCALE), FEATURE_SCALE)
+        return jnp.concatenate([jnp.maximum(multipliers, 0.0), q])
 
-    def project_dual(self, point: jax.Array, step: jax.Array) -> jax.Array:
-        """Onto x >= 0, sum x = 1."""
+    def project_dual(self, point: jax.Array, step) -> jax.Array:
+        """Onto the affine set A."""
         del step
-        flat = point.reshape(-1, point.shape[-1])
-        return project_simplex(flat).reshape(point.shape)
+        mdp = self.mdp
+        x, u = self._split(point)
+        x = x.reshape(mdp.num_states, mdp.num_actions, -1)
+        initial = (1.0 - mdp.discount) * mdp.initial[:, None]
+        flow = x.sum(axis=1) - mdp.discount * push_forward(mdp, x) - initial
+        on_flow, on_features = self.projection.solve(flow, self._expected(x) - FEATURE_SCALE * u)
+        change = jnp.tensordot(self.features, on_features, axes=1)
+        moved = [on_flow - mdp.discount * value for value in expected_next_values(mdp, on_flow)]
+        x = x - change - jnp.stack(moved, axis=1)
+        return jnp.concatenate([x.reshape(-1, x.shape[-1]), u + FEATURE_SCALE * on_features])
 
-    def bounds(self, primal, x, forward, adjoint) -> tuple[jax.Array, jax.Array]:
-        """Lower and upper bounds on (1 - gamma) v*."""
-        linear = self._linear()
-        upper = forward.max(axis=(0, 1)) + (linear * primal).sum(axis=0)
-        gradient_w, gradient_h = self._split(adjoint + linear)
-        low, high = self._box()
-        worst_h = jnp.minimum(low * gradient_h, high * gradient_h).sum(axis=0)
-        return gradient_w.min(axis=0) + worst_h, upper
+    def bounds(self, primal, dual, forward, adjoint) -> tuple[jax.Array, jax.Array]:
+        """None: certificates are made of policies and weights, outside the iteration."""
+        del dual, forward, adjoint
+        infinity = jnp.full(primal.shape[-1], jnp.inf, primal.dtype)
+        return -infinity, infinity
 
     def norm_bound(self) -> jax.Array:
-        """Infinite: the power iteration's estimate is used as it is."""
-        return jnp.full(self.expectations.shape[-1], jnp.inf, self.mdp.dtype)
+        """1."""
+        return jnp.ones(self.expectations.shape[-1], self.mdp.dtype)
+
+    def weights(self, primal: jax.Array) -> jax.Array:
+        """w [K, lanes], in the simplex."""
+        _, q = self._split(primal)
+        return project_simplex(q / FEATURE_SCALE)
+
+    def occupancies(self, primal: jax.Array, dual: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Two non-negative readings of x, [S, A, lanes]: on the flow up to clipping, and complementary to lambda."""
+        (multipliers, _), (x, _) = self._split(primal), self._split(dual)
+        shape = (self.mdp.num_states, self.mdp.num_actions, -1)
+        readings = jnp.maximum(x, 0.0), jnp.maximum(x - weight * multipliers, 0.0)
+        return tuple(reading.reshape(shape) for reading in readings)
 
     def _split(self, stacked: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return stacked[: self.mdp.num_features], stacked[self.mdp.num_features :]
+        pairs = self.mdp.num_states * self.mdp.num_actions
+        return stacked[:pairs], stacked[pairs:]
 
-    def _linear(self) -> jax.Array:
-        lanes = self.expectations.shape[-1]
-        initial = jnp.broadcast_to(self.mdp.initial[:, None], (self.mdp.num_states, lanes))
-        return jnp.concatenate([-self.expectations, initial])
-
-    def _box(self) -> tuple[jax.Array, jax.Array]:
-        return self.mdp.features.min(), self.mdp.features.max()
+    def _expected(self, x: jax.Array) -> jax.Array:
+        """Phi^T x, [S, A, lanes] -> [K, lanes]."""
+        if self.features.shape[1] == 1:
+            x = x.sum(axis=1, keepdims=True)
+        return jnp.tensordot(self.features, x, axes=((0, 1), (0, 1)))

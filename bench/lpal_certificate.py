@@ -1,0 +1,61 @@
+"""The certificate of an answer (x, w) to LPAL, whoever found it.
+
+The policy is read off x (eq. 5; where the state hardly occurs, a best response to w). A sparse LU factorisation of
+SciPy, none of our solvers, gives its occupancy and its margin min_k V_k(pi) - Vhat_k; planning for w gives the bound.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+
+import jaxhom
+from bench.lpal_program import Model
+
+_NO_OCCUPANCY = 1e-9  # share of all discounted time
+_PLANNING_SHARE = 0.02  # of the gap asked, that planning may add to the bound
+
+
+def margin(model: Model, policy: np.ndarray, expectations: np.ndarray) -> float:
+    """min_k V_k(policy) - Vhat_k of one policy [S, A], by an exact solve."""
+    system = scipy.sparse.eye_array(model.num_states) - model.discount * model.policy_matrix(policy)
+    if model.transition.nnz > 0.25 * model.num_states * model.transition.shape[0]:
+        occupancy = np.linalg.solve(system.toarray().T, model.initial)
+    else:
+        factors = scipy.sparse.linalg.splu(system.T.tocsc(), permc_spec="MMD_AT_PLUS_A")
+        occupancy = factors.solve(model.initial)
+    x = (np.maximum(occupancy, 0.0)[:, None] * policy).ravel()
+    return float((model.features.T @ x - expectations).min())
+
+
+def policy_of(x: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """pi(s, a) = x(s, a) / sum_a' x(s, a'), [S, A]; `fallback` where the state hardly occurs."""
+    x = np.maximum(x, 0.0)
+    total = x.sum(axis=-1, keepdims=True)
+    occurs = total > _NO_OCCUPANCY * total.sum()
+    return np.where(occurs, x / np.where(occurs, total, 1.0), fallback)
+
+
+def bounds(mdp: jaxhom.MDP, w: np.ndarray, expectations: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Upper bounds [B] on the best margins, and policies [B, S, A] that are optimal for the weights w [B, K]."""
+    w = np.maximum(w, 0.0)
+    w = w / w.sum(axis=1, keepdims=True)
+    reward = jnp.einsum("sak,bk->bsa", mdp.features, w)
+    plan = jaxhom.optimal_policy(mdp, reward, tolerance=_PLANNING_SHARE * gap * (1.0 - float(mdp.discount)))
+    best = np.asarray(plan.upper_bound(mdp) @ mdp.initial)
+    return best - (w * expectations).sum(axis=1), np.asarray(plan.policy)
+
+
+def certified_gap(mdp: jaxhom.MDP, model: Model, x: list, w: list, expectations: np.ndarray, gap: float) -> np.ndarray:
+    """Bound minus margin, [B], of answers x (each [S, A]) and w (each [K]); infinite where there is no answer."""
+    found = np.full(len(x), np.inf)
+    for lane, (point, weights) in enumerate(zip(x, w, strict=True)):
+        if point is None or not _is_answer(point, weights):
+            continue
+        bound, policy = bounds(mdp, weights[None], expectations[lane][None], gap)
+        found[lane] = bound[0] - margin(model, policy_of(point, policy[0]), expectations[lane])
+    return found
+
+
+def _is_answer(x: np.ndarray, w: np.ndarray) -> bool:
+    return bool(np.isfinite(x).all() and np.isfinite(w).all() and (x > 0).any() and (w > 0).any())

@@ -13,9 +13,7 @@ import sys
 import tempfile
 import time
 
-_THREAD_VARIABLES = (
-    *("OMP_NUM_THREADS", "RAYON_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
-)
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "RAYON_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def start(module: str, function: str, task: dict, threads: int = 2) -> "Job":
@@ -55,9 +53,13 @@ class Job:
         except subprocess.TimeoutExpired:
             return None
         finally:
-            self._process.kill()
-            self._process.wait()
-            self._folder.cleanup()
+            self.stop()
+
+    def stop(self) -> None:
+        """Ends the process, if it still runs, and removes its files."""
+        self._process.kill()
+        self._process.wait()
+        self._folder.cleanup()
 
 
 def main() -> None:

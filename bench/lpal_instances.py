@@ -157,4 +157,3 @@ INSTANCES = {
     "racetrack_a": _track("a"),
     "racetrack_b": _track("b"),
 }
-OVER_STATES = ("grid16", "grid24", "grid32", "grid48", "grid100", "grid316")  # one family: the figure's points

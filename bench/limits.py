@@ -5,6 +5,7 @@ process that can be ended settles all three.
 """
 
 import importlib
+import itertools
 import os
 import pathlib
 import pickle
@@ -13,10 +14,11 @@ import sys
 import tempfile
 import time
 
+THREADS = 2
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "RAYON_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def start(module: str, function: str, task: dict, threads: int = 2) -> "Job":
+def start(module: str, function: str, task: dict, threads: int = THREADS) -> "Job":
     """Starts `bench.MODULE.FUNCTION(**task)`; task and result are pickled."""
     folder = tempfile.TemporaryDirectory()
     task_path, result_path, log_path = (pathlib.Path(folder.name) / name for name in ("task", "result", "log"))
@@ -60,6 +62,24 @@ class Job:
         self._process.kill()
         self._process.wait()
         self._folder.cleanup()
+
+
+def side_by_side(module: str, function: str, task: dict, key: str, values, processes: int, limit: float):
+    """Shares `values` between processes, each with its part of the threads, and returns what they found, in order.
+
+    None if one of them took longer than `limit` seconds.
+    """
+    processes = min(processes, len(values))
+    threads = THREADS // processes
+    cuts = [len(values) * k // processes for k in range(processes + 1)]
+    shares = [values[low:high] for low, high in itertools.pairwise(cuts)]
+    jobs = [start(module, function, task | {key: share, "threads": threads}, threads) for share in shares]
+    try:
+        parts = [job.result(limit) for job in jobs]
+    finally:
+        for job in jobs:
+            job.stop()
+    return None if any(part is None for part in parts) else parts
 
 
 def main() -> None:

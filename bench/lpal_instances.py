@@ -73,11 +73,16 @@ def _monte_carlo(mdp, key, policy, horizon: int) -> np.ndarray:
 def regions(size: int, num_regions: int) -> jaxhom.MDP:
     """A grid with indicators of square regions, as even as its size allows."""
     world = jaxhom.gridworld(size, discount=DISCOUNT, dtype=np.float64)
-    side = round(num_regions**0.5)
-    region = (np.asarray(world.coordinates) * side // size) @ np.array([side, 1])
-    features = jnp.asarray(region[:, None] == np.arange(num_regions), float)
+    features = jnp.asarray(region_of(size, num_regions)[:, None] == np.arange(num_regions), float)
     shape = (world.mdp.num_states, world.mdp.num_actions, num_regions)
     return world.mdp.replace(features=jnp.broadcast_to(features[:, None], shape))
+
+
+def region_of(size: int, num_regions: int) -> np.ndarray:
+    """The region of every cell of a grid, [S]."""
+    side = round(num_regions**0.5)
+    line = np.arange(size) * side // size
+    return (side * line[:, None] + line).ravel()
 
 
 def bumps(size: int) -> jaxhom.MDP:
@@ -120,7 +125,8 @@ def _positive_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
     return np.random.default_rng([seed, lane]).random(num_features)
 
 
-def _track_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
+def track_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
+    """The paper's two rewards, each times a number uniform on [0.5, 1.5]."""
     return _TRACK_WEIGHTS * np.random.default_rng([seed, lane]).uniform(0.5, 1.5, num_features)
 
 
@@ -137,7 +143,7 @@ def _track(name: str) -> Instance:
     def build():
         return jaxhom.racetrack(name, discount=DISCOUNT, dtype=np.float64).mdp
 
-    return Instance(f"racetrack {name}, Monte Carlo", build, _track_weights, "monte_carlo", 30)
+    return Instance(f"racetrack {name}, Monte Carlo", build, track_weights, "monte_carlo", 30)
 
 
 INSTANCES = {

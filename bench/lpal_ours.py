@@ -35,7 +35,7 @@ def solve(
     x, w, seconds, statuses, iterations, compile_s = [], [], [], [], [], []
     begin = time.perf_counter()
     for part in [expectations] if batch else expectations:
-        found, first, again = _timed(lambda part=part: call(part), limit)
+        found, first, again = timed(lambda part=part: call(part), limit)
         many = 1 if part.ndim == 1 else len(part)
         x += list(np.asarray(found.occupancy).reshape(many, mdp.num_states, mdp.num_actions))
         w += list(np.asarray(found.weights).reshape(many, -1))
@@ -48,7 +48,7 @@ def solve(
     return Answer(x, w, seconds, statuses, build, compile_s[0]), iterations
 
 
-def _timed(call, limit: float):
+def timed(call, limit: float):
     """(result, seconds of the first call, median of the next; both the first's if there is no time for another)."""
     start = time.perf_counter()
     result = call()

@@ -13,6 +13,11 @@ import functools
 
 import numpy as np
 import scipy.sparse as sparse
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+_DENSE = 0.25  # share of entries that are not 0
+_SCATTERED = 0.1  # mean distance of a state's successors in the best order, as a share of all states
+_MIN_SCATTERED = 2000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +57,8 @@ class Model:
     @classmethod
     def of(cls, mdp) -> "Model":
         """Of a `jaxhom.MDP`."""
-        features = sparse.csr_array(np.asarray(mdp.features, float).reshape(-1, mdp.num_features))
+        shape = (mdp.num_states * mdp.num_actions, mdp.num_features)
+        features = sparse.csr_array(np.asarray(mdp.features, float).reshape(shape))
         arrays = (np.asarray(mdp.next_state), np.asarray(mdp.probability, float))
         return cls(*arrays, features, np.asarray(mdp.initial, float), float(mdp.discount))
 
@@ -81,6 +87,23 @@ class Model:
         found.sum_duplicates()
         found.eliminate_zeros()
         return found
+
+    @functools.cached_property
+    def is_dense(self) -> bool:
+        """Whether full matrices are the faster ones."""
+        return self.transition.nnz > _DENSE * self.num_states * self.transition.shape[0]
+
+    @functools.cached_property
+    def is_scattered(self) -> bool:
+        """Whether no order of the states makes a band of the graph, so that sparse factors fill up."""
+        if self.num_states <= _MIN_SCATTERED:
+            return False
+        uniform = np.full((self.num_states, self.num_actions), 1.0 / self.num_actions)
+        graph = self.policy_matrix(uniform)
+        order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+        place, graph = np.argsort(order), graph.tocoo()
+        distance = np.abs(place[graph.row] - place[graph.col])
+        return bool(np.mean(distance) > _SCATTERED * self.num_states)
 
     @functools.cached_property
     def flow(self) -> sparse.csr_array:

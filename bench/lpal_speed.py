@@ -157,23 +157,15 @@ def settled(problem: Problem, method: str, settings, vectors, batch: bool) -> tu
 
 def solve(problem: Problem, method: str, settings, vectors: np.ndarray, limit: float, batch: bool):
     """(`Answer` or the fields of a row without one, number of processes)."""
-    together = batch and method not in lpal_peers.USES_BOTH_CORES
-    shares = np.array_split(np.arange(len(vectors)), 2 if together else 1)
+    processes = 2 if batch and method not in lpal_peers.USES_BOTH_CORES else 1
     task = {"method": method, "settings": settings, "model": problem.model, "limit": limit, "batch": batch}
-    threads = 1 if together else 2
-    task["threads"] = threads
-    jobs = [limits.start("lpal_peers", "solve", task | {"expectations": vectors[i]}, threads) for i in shares]
     try:
-        parts = [job.result(limit + _START_UP) for job in jobs]
+        parts = limits.side_by_side("lpal_peers", "solve", task, "expectations", vectors, processes, limit + _START_UP)
     except RuntimeError as error:
-        return {"status": "failed", "note": str(error)}, len(jobs)
-    finally:
-        for job in jobs:
-            job.stop()
-    short = batch and any(part is not None and len(part.x) < len(i) for part, i in zip(parts, shares, strict=True))
-    if short or any(part is None for part in parts):
-        return {"status": "time limit", "note": f"no answer in {problem.limit:g} s"}, len(jobs)
-    return (_joined(parts, len(vectors)) if batch else parts[0]), len(jobs)
+        return {"status": "failed", "note": str(error)}, processes
+    if parts is None or (batch and sum(len(part.x) for part in parts) < len(vectors)):
+        return {"status": "time limit", "note": f"no answer in {problem.limit:g} s"}, processes
+    return (_joined(parts, len(vectors)) if batch else parts[0]), len(parts)
 
 
 def _joined(parts: list[lpal_peers.Answer], lanes: int) -> lpal_peers.Answer:

@@ -1,4 +1,5 @@
-"""LPAL by other solvers: Moreau, Clarabel, HiGHS, GLOP and PDLP of OR-tools, MPAX. Each with the settings in `BEST`.
+"""LPAL by other solvers: Moreau, Clarabel, HiGHS, GLOP and PDLP of OR-tools, MPAX. Each with the best of its
+`CANDIDATES`.
 
 A solver is opened once per model and asked for one expectation vector after another; Moreau also takes a batch of them.
 It runs in a process of its own (`bench.limits`), in which every solver but MPAX never imports JAX. Answers are (x, w):
@@ -32,6 +33,11 @@ class Settings:
     tolerance: float
     options: dict = dataclasses.field(default_factory=dict)
 
+    def __str__(self) -> str:
+        unit = "shares" if self.shares else "sums"
+        options = "".join(f", {name} {value}" for name, value in self.options.items())
+        return f"{self.form} in {unit}, tolerance {self.tolerance:g}{options}"
+
 
 MODULES = {
     "moreau": "moreau",
@@ -43,15 +49,28 @@ MODULES = {
     "ortools_pdlp": "ortools",
     "mpax": "mpax",
 }
-BEST = {
-    "moreau": Settings("primal", True, 1e-6),
-    "clarabel": Settings("primal", True, 1e-6),
-    "highs_simplex": Settings("primal", False, 1e-7),
-    "highs_interior_point": Settings("primal", True, 1e-6),
-    "highs_pdlp": Settings("primal", True, 1e-6),
-    "glop": Settings("primal", False, 1e-7),
-    "ortools_pdlp": Settings("primal", True, 1e-6),
-    "mpax": Settings("primal", True, 1e-6),
+_PRIMAL_SIMPLEX = {"simplex_strategy": 4, "presolve": "off"}
+_DUAL_SIMPLEX = {"use_dual_simplex": "true"}
+CANDIDATES = {  # the fastest on one instance or another; the best of them is taken on each
+    "moreau": (Settings("dual", False, 1e-6), Settings("primal", False, 1e-5)),
+    "clarabel": (Settings("dual", False, 1e-6), Settings("primal", False, 1e-5)),
+    "highs_simplex": (
+        Settings("dual", True, 1e-7, _PRIMAL_SIMPLEX | {"simplex_scale_strategy": 0}),
+        Settings("dual", True, 1e-7, _PRIMAL_SIMPLEX),
+        Settings("primal", True, 1e-7),
+    ),
+    "highs_interior_point": (
+        Settings("dual", True, 1e-5, {"presolve": "off"}),
+        Settings("dual", False, 1e-6, {"presolve": "off"}),
+    ),
+    "highs_pdlp": (Settings("dual", False, 1e-5), Settings("dual", True, 1e-5)),
+    "glop": (
+        Settings("dual", True, 1e-7, _DUAL_SIMPLEX),
+        Settings("dual", True, 1e-7, _DUAL_SIMPLEX | {"use_preprocessing": "false"}),
+        Settings("primal", False, 1e-7),
+    ),
+    "ortools_pdlp": (Settings("dual", True, 1e-5), Settings("primal", True, 1e-5)),
+    "mpax": (Settings("primal", True, 1e-5), Settings("dual", True, 1e-5)),
 }
 USES_BOTH_CORES = ("mpax",)  # alone: other peers' batches are shared between two processes
 LEAST_TOLERANCE = 1e-10

@@ -91,19 +91,29 @@ def _mdpsolver(algorithm: str, model: Model, epsilon: float, threads: int) -> Ca
     import mdpsolver
 
     name = {"value_iteration": "vi", "policy_iteration": "pi", "modified_policy_iteration": "mpi"}[algorithm]
+    choice: list[bool] = []  # whether threads pay, tried on the first reward
     probabilities, columns = (_nested(model, array) for array in (model.transition.data, model.transition.indices))
 
     def prepare(reward):
         solver = mdpsolver.model()
         solver.mdp(discount=model.discount, rewards=reward.tolist(), tranMatProbs=probabilities, tranMatColumns=columns)
 
-        def solve():
-            solver.solve(algorithm=name, tolerance=epsilon, parallel=threads > 1, makeFinalCheck=False)
+        def solve(parallel=None):
+            parallel = choice[0] if parallel is None else parallel
+            solver.solve(algorithm=name, tolerance=epsilon, parallel=parallel, makeFinalCheck=False)
             return np.asarray(solver.getPolicy()), 0
 
+        if not choice:
+            choice.append(threads > 1 and _seconds(lambda: solve(True)) < _seconds(lambda: solve(False)))
         return solve
 
     return prepare
+
+
+def _seconds(call: Callable) -> float:
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
 
 
 def _nested(model: Model, entries: np.ndarray) -> list:

@@ -63,14 +63,14 @@ CANDIDATES = {  # the fastest on one instance or another; the best of them is ta
         Settings("dual", True, 1e-5, {"presolve": "off"}),
         Settings("dual", False, 1e-6, {"presolve": "off"}),
     ),
-    "highs_pdlp": (Settings("dual", False, 1e-5), Settings("dual", True, 1e-5)),
+    "highs_pdlp": (Settings("dual", False, 1e-5),),
     "glop": (
         Settings("dual", True, 1e-7, _DUAL_SIMPLEX),
         Settings("dual", True, 1e-7, _DUAL_SIMPLEX | {"use_preprocessing": "false"}),
         Settings("primal", False, 1e-7),
     ),
-    "ortools_pdlp": (Settings("dual", True, 1e-5), Settings("primal", True, 1e-5)),
-    "mpax": (Settings("primal", True, 1e-5), Settings("dual", True, 1e-5)),
+    "ortools_pdlp": (Settings("dual", True, 1e-5),),
+    "mpax": (Settings("primal", True, 1e-5),),
 }
 USES_BOTH_CORES = ("mpax",)  # alone: other peers' batches are shared between two processes
 LEAST_TOLERANCE = 1e-10

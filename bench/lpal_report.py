@@ -84,8 +84,8 @@ def _cells(row: dict | None, best: dict) -> list[str]:
     if row is None:
         return ["", "", ""]
     seconds, gap = number(row, "seconds"), number(row, "gap_certified")
-    if seconds is None:
-        return [row["note"] if row["status"] == "time limit" else row["status"], "", ""]
+    if row["status"] != "measured" or seconds is None:
+        return [row["note"].split(" (")[0] if row["status"] == "time limit" else row["status"], "", ""]
     share = "" if gap is None else f"{gap / number(row, 'gap_asked'):.2g}"
     if not is_settled(row):
         return [f"{seconds:.3g} (open)", share, ""]

@@ -35,6 +35,7 @@ SINGLE_LANES, QUICK_SINGLE_LANES = 3, 1
 OUR_LANES = {"grid316": 8}  # what 24 GB hold
 _FEWER_LANES = (8, 2)  # of a peer's batch that would take too long
 _ONE_THREAD = 1.5  # a peer's lane on one thread may take so much longer than on two
+_FIRST_SHARE = 0.2
 _LEAST_LIMIT = 10.0  # for a second try
 _START_UP = 60.0  # to import, build and compile, beyond the limit
 _PACKAGES = ("jax", "moreau", "clarabel", "highspy", "ortools", "mpax", "scipy")
@@ -136,16 +137,21 @@ def peer_rows(problem: Problem, method: str) -> Iterator[dict]:
 
 
 def best(problem: Problem, method: str) -> tuple[dict, lpal_peers.Settings]:
-    """Fields and settings of the fastest candidate; later ones have as long as the best took, and a warm-up."""
-    chosen, limit = None, problem.limit
-    for settings in lpal_peers.CANDIDATES[method]:
+    """Fields and settings of the fastest candidate.
+
+    Each has a share of the time limit, later ones not much longer than the best so far took. If none of them gives an
+    answer in that time, the first has all of it.
+    """
+    candidates, chosen = lpal_peers.CANDIDATES[method], None
+    limit = _FIRST_SHARE * problem.limit if len(candidates) > 1 else problem.limit
+    for settings in candidates:
         fields, settings = settled(dataclasses.replace(problem, limit=limit), method, settings, batch=False)
-        is_better = chosen is None or (fields.get("settled") and fields["seconds"] < chosen[0]["seconds"])
-        chosen = (fields, settings) if is_better else chosen
-        if not chosen[0].get("settled"):
-            break
-        limit = min(problem.limit, (problem.single + 2) * chosen[0]["seconds"] + _LEAST_LIMIT)
-    return chosen
+        if fields.get("settled") and (chosen is None or fields["seconds"] < chosen[0]["seconds"]):
+            chosen = fields, settings
+            limit = min(limit, (problem.single + 2) * fields["seconds"] + _LEAST_LIMIT)
+    if chosen is None and len(candidates) > 1:
+        return settled(problem, method, candidates[0], batch=False)
+    return chosen or (fields, settings)
 
 
 def settled(
@@ -167,7 +173,8 @@ def settled(
             return fields, settings
         out_of_time = spent > problem.limit or len(found.x) < len(vectors)
         if out_of_time or tighter.tolerance < lpal_peers.LEAST_TOLERANCE:
-            return fields | ({"status": "time limit"} if out_of_time else {}), settings
+            late = {"status": "time limit", "note": f"no answer in {problem.limit:g} s ({settings})"}
+            return fields | (late if out_of_time else {}), settings
         settings = tighter
 
 

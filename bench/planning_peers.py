@@ -5,6 +5,7 @@ Run in a process of its own by `bench.limits`. What a toolbox derives from the m
 
 import dataclasses
 import importlib.util
+import statistics
 import time
 from collections.abc import Callable
 
@@ -29,6 +30,8 @@ SOLVERS = ("scipy spsolve", "scipy splu", "numpy solve")
 LEAST_TOLERANCE = 1e-10  # times the largest value
 _MAX_ITERATIONS = 1_000_000
 _MAX_DENSE_STATES = 6000
+_REPEATS = 4
+_ENOUGH_SECONDS = 0.5  # of one lane's repetitions
 _SHARE_OF_WARM_UP = 0.1  # of the time limit, that a first solve may take to count as a warm-up
 
 
@@ -188,24 +191,30 @@ def can_evaluate(method: str, model: Model) -> bool:
 
 
 def _timed(prepared: list[Callable], build: float, limit: float) -> Results:
-    """Calls of each lane after its preparation, which is counted as building; a quick first lane is a warm-up too."""
-    begin, found, seconds, iterations, compile_s = time.perf_counter(), [], [], [], 0.0
+    """Calls of each lane, each after a new preparation, which counts as building.
+
+    Quick ones are repeated, for their median; a quick first lane has a warm-up too.
+    """
+    begin, found, medians, iterations, compile_s = time.perf_counter(), [], [], [], 0.0
     for lane, prepare in enumerate(prepared):
-        for attempt in range(2):
+        seconds = []
+        while True:
             start = time.perf_counter()
             solve = prepare()
             build += time.perf_counter() - start
             start = time.perf_counter()
             answer, count = solve()
-            took = time.perf_counter() - start
-            if lane or attempt or took > _SHARE_OF_WARM_UP * limit:
+            seconds.append(time.perf_counter() - start)
+            if lane == 0 and len(seconds) == 1 and seconds[0] <= _SHARE_OF_WARM_UP * limit:
+                continue
+            if len(seconds) == _REPEATS or sum(seconds) > _ENOUGH_SECONDS:
                 break
-            compile_s = took
-        if lane == 0:
-            compile_s = max(compile_s - took, 0.0)
+        if lane == 0 and len(seconds) > 1:
+            compile_s = max(seconds[0] - seconds[1], 0.0)
+            seconds = seconds[1:]
         found.append(answer)
-        seconds.append(took)
+        medians.append(statistics.median(seconds))
         iterations.append(int(count))
-        if time.perf_counter() - begin + took > limit:
+        if time.perf_counter() - begin + max(seconds) > limit:
             break
-    return Results(found, seconds, build, compile_s, iterations)
+    return Results(found, medians, build, compile_s, iterations)

@@ -87,7 +87,7 @@ def is_installed(method: str) -> bool:
 
 
 class Highs:
-    """HiGHS: dual simplex, interior point without crossover, or PDLP. A simplex starts from the former basis."""
+    """HiGHS: simplex, interior point with a crossover only where it gets stuck, or PDLP."""
 
     def __init__(self, method: str, program: Program, settings: Settings, threads: int):
         import highspy
@@ -100,7 +100,7 @@ class Highs:
         if method == "highs_simplex":
             options.solver = "simplex"
         elif method == "highs_interior_point":
-            options.solver, options.run_crossover, options.ipm_optimality_tolerance = "ipm", "off", tolerance
+            options.solver, options.run_crossover, options.ipm_optimality_tolerance = "ipm", "choose", tolerance
         else:
             options.solver, options.pdlp_optimality_tolerance = "pdlp", tolerance
         for name, value in settings.options.items():

@@ -54,7 +54,7 @@ def table(rows: list[dict]) -> str:
     lines = ["# Speed of LPAL", "", "Made from the rows of the CSV file of the same name. Seconds per lane, on the"]
     lines += ["machine's two cores, compilation apart; gaps are the worst lane's, as a share of what was asked.", ""]
     for section in dict.fromkeys(row["section"] for row in rows):
-        members = [row for row in rows if row["section"] == section]
+        members = sorted((row for row in rows if row["section"] == section), key=lambda row: not is_ours(row))
         lines += _heading(members)
         lines += [
             "| method | one, s | gap | against best peer | batch | each, s | gap | against best peer | compile s |"

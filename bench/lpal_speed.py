@@ -131,9 +131,21 @@ def peer_rows(problem: Problem, method: str) -> Iterator[dict]:
     expected = _ONE_THREAD * fields["seconds"] / 2.0
     for lanes in (len(problem.expectations), *_FEWER_LANES):
         if lanes * expected <= problem.limit:
-            fields, _ = settled(problem, method, settings, batch=True, lanes=lanes)
-            yield problem.row(method, lanes, **fields)
+            yield problem.row(method, lanes, **batch_fields(problem, method, settings, lanes))
             return
+
+
+def batch_fields(problem: Problem, method: str, settings: lpal_peers.Settings, lanes: int) -> dict:
+    """Fields of a batch, with the settings that were best for a single one, or others where a lane stays open."""
+    first, _ = settled(problem, method, settings, batch=True, lanes=lanes)
+    if first.get("settled"):
+        return first
+    for other in lpal_peers.CANDIDATES[method]:
+        if dataclasses.replace(other, tolerance=settings.tolerance) != settings:
+            fields, _ = settled(problem, method, other, batch=True, lanes=lanes)
+            if fields.get("settled"):
+                return fields
+    return first
 
 
 def best(problem: Problem, method: str) -> tuple[dict, lpal_peers.Settings]:

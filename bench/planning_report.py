@@ -52,7 +52,9 @@ def table(rows: list[dict]) -> str:
     lines = ["# Speed of planning and of occupancies", "", "Made from the rows of the CSV file of the same name."]
     lines += ["Seconds per lane on the machine's two cores, compilation apart; errors are the worst lane's.", ""]
     for work, title in WORKS.items():
+        order = {section: k for k, section in enumerate(SECTIONS)}
         members = [row for row in rows if row["work"] == work]
+        members.sort(key=lambda row: (order[row["section"]], not is_ours(row), row["method"], is_batch(row)))
         if not members:
             continue
         lines += [f"## {title}", ""]

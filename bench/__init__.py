@@ -7,6 +7,10 @@ figures and words. The flow of a sweep, one module each:
     sweep     runs settings x methods in batches of draws, appends one row per draw (`rows`), resumes
     summaries means over draws with confidence intervals (`intervals`)
     report    reads rows only: `comparison` with the paper in words, `tables`, `figures`
+
+`python -m bench.speed similarity | lpal | planning` measures speed next to other solvers. For each kind, X_speed draws
+instances, asks this library and the peers, judges both by one certificate and prints rows (`speed_rows`); X_report
+makes a table and a figure of the rows; peers run in processes of their own with a time limit (`limits`).
 """
 
 import os

@@ -6,13 +6,9 @@ time is the median of three calls after a first one that compiles; `compile_s` i
 """
 
 import argparse
-import functools
-import json
 import statistics
-import subprocess
 import time
 from collections.abc import Iterator
-from importlib import metadata
 
 import jax
 
@@ -23,6 +19,7 @@ import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
 from bench import peers  # noqa: E402
+from bench.speed_rows import commit, print_row, versions  # noqa: E402
 from jaxhom.brackets import bracket_errors  # noqa: E402
 from jaxhom.homomorphism import ClassSimilarity  # noqa: E402
 from jaxhom.local_models import local_model_classes, restricted_model  # noqa: E402
@@ -45,28 +42,9 @@ MAX_PDHG_SIZE = 8  # tight brackets of larger random models take it a tenth of a
 OUR_COUNTS = (1, 8, 64, 512, 4096, 32768)
 PEER_COUNTS = (1, 8, 64, 512)
 _HIGHS_SECONDS = 300.0
+_PACKAGES = ("jax", "highspy", "moreau", "mpax")
 
 # --------------------------------------------------------------------------------------------------- rows and timing
-
-
-@functools.cache
-def versions() -> str:
-    """Of the solvers that are installed."""
-    found = []
-    for name in ("jax", "highspy", "moreau", "mpax"):
-        try:
-            found.append(f"{name} {metadata.version(name)}")
-        except metadata.PackageNotFoundError:
-            continue
-    return "; ".join(found)
-
-
-@functools.cache
-def commit() -> str:
-    """Short hash of the working tree's commit, with a + if files differ from it."""
-    command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
-    return found.stdout.strip() or "unknown"
 
 
 def row(work: str, method: str, pairs: int, seconds: float | None = None, **fields) -> dict:
@@ -75,7 +53,7 @@ def row(work: str, method: str, pairs: int, seconds: float | None = None, **fiel
     base |= {"devices": jax.device_count(), "processes": 1, "dtype": "float64", "gap_asked": GAP, "status": "measured"}
     if seconds is not None:
         base |= {"seconds": seconds, "ms_per_pair": 1e3 * seconds / max(pairs, 1)}
-    return base | {"versions": versions(), "commit": commit()} | fields
+    return base | {"versions": versions(*_PACKAGES), "commit": commit()} | fields
 
 
 def timed(call, repeats: int = 3):
@@ -431,7 +409,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
     for found in SECTIONS[arguments.section](arguments.quick):
-        print("ROW " + json.dumps(found), flush=True)
+        print_row(found)
 
 
 if __name__ == "__main__":

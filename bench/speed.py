@@ -1,237 +1,63 @@
 """How fast the library is, next to other solvers on the same instances.
 
-    python -m bench.speed similarity [--quick] [--sections NAME ...] [--output bench/results/speed_similarity.csv]
+    python -m bench.speed similarity | lpal | planning [--quick] [--sections NAME ...] [--methods NAME ...]
 
-writes one row per measurement, and from the rows alone a Markdown table and a log-log figure beside the CSV;
-`--report` makes these two again from the rows on disk without measuring anything. This module never imports JAX: every
-section runs in a process of its own (see `bench.similarity_speed`).
+writes one row per measurement to `bench/results/speed_KIND.csv`, and from the rows alone a Markdown table and a log-log
+figure beside it; `--report` makes these two again from the rows on disk without measuring anything. Where `--sections`
+or `--methods` are given, the other rows on disk stay. This module never imports JAX: every section runs in a process of
+its own (`bench.similarity_speed`, `bench.lpal_speed`, `bench.planning_speed`).
 """
 
 import argparse
-import csv
-import json
 import pathlib
-import subprocess
 import sys
 
-FIELDS = (
-    *(
-        "section",
-        "work",
-        "n",
-        "m",
-        "actions",
-        "pairs",
-        "method",
-        "dtype",
-        "device",
-        "devices",
-        "processes",
-        "gap_asked",
-    ),
-    *(
-        "gap_asked",
-        "gap_certified",
-        "settled",
-        "compile_s",
-        "build_s",
-        "seconds",
-        "ms_per_pair",
-        "gflops",
-        "peak_fraction",
-    ),
-    *("gbytes_per_s", "status", "note", "versions", "commit"),
-)
-SIMILARITY = (
-    *("peak", "brackets", "counts", "decisions", "gradients", "peers"),
-    *("racetrack", "algorithm1", "global", "global_large"),
-)
-QUICK = ("brackets", "decisions", "gradients", "peers")
-_MIN_SETTLED = 0.98
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
-_MARKERS = "osD^vP*X"
+from bench import lpal_report, planning_report, similarity_report, speed_rows
+
+KINDS = {"similarity": similarity_report.KIND, "lpal": lpal_report.KIND, "planning": planning_report.KIND}
 
 
-def run_section(section: str, quick: bool) -> list[dict]:
-    """Rows of one section, measured in a process of its own; a section that fails is a row too."""
-    command = [sys.executable, "-m", "bench.similarity_speed", section] + ["--quick"] * quick
-    rows = []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        for line in process.stdout:
-            if line.startswith("ROW "):
-                rows.append(json.loads(line.removeprefix("ROW ")))
-                shown = (rows[-1].get(name, "") for name in ("work", "method", "dtype", "n", "pairs", "ms_per_pair"))
-                print("  ", *shown, file=sys.stderr, flush=True)
-    if process.returncode:
-        rows.append({"work": section, "status": "failed", "note": f"exit code {process.returncode}"})
-    return [{"section": section} | row for row in rows]
-
-
-def read(path: pathlib.Path) -> list[dict]:
-    """Rows of a CSV file, all fields as text."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def write(path: pathlib.Path, rows: list[dict]) -> None:
-    """Writes rows as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, FIELDS)
-        writer.writeheader()
-        writer.writerows([{name: _short(value) for name, value in row.items()} for row in rows])
-
-
-def _short(value):
-    return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-# -------------------------------------------------------------------------------------------------------------- report
-
-
-def _is_ours(row: dict) -> bool:
-    return row["method"].startswith("jaxhom")
-
-
-def _number(row: dict, name: str) -> float | None:
-    return float(row[name]) if row.get(name) else None
-
-
-def best_peers(rows: list[dict]) -> dict[tuple[str, str], float]:
-    """Least time per pair among the peers that certify nearly every pair, by work and n.
-
-    The peers have no decisions: a solve in full stands in for one.
-    """
-    best: dict[tuple[str, str], float] = {}
-    for row in rows:
-        if _is_ours(row) or row["status"] != "measured" or (_number(row, "settled") or 0.0) < _MIN_SETTLED:
-            continue
-        works = ("brackets", "decisions") if row["work"] == "brackets" else (row["work"],)
-        for work in works:
-            key = (work, row["n"])
-            best[key] = min(best.get(key, float("inf")), float(row["ms_per_pair"]))
-    return best
-
-
-def table(rows: list[dict]) -> str:
-    """A Markdown table for each kind of work."""
-    best = best_peers(rows)
-    lines = ["# Speed of the similarity engine", "", "Made from the rows of the CSV file of the same name.", ""]
-    for work in dict.fromkeys(row["work"] for row in rows):
-        if work in ("peak", "one PDHG iteration"):
-            continue
-        lines += [
-            f"## {work}",
-            "",
-            "| n | m | pairs | method | type | devices | processes | gap | settled | compile s | s |"
-            " ms/pair | against best peer |",
-            "|" + "---|" * 13,
-        ]
-        members = [row for row in rows if row["work"] == work]
-        lines += [_table_line(row, best) for row in sorted(members, key=lambda row: _number(row, "n") or 0.0)] + [""]
-    return "\n".join(lines + _peak_table(rows))
-
-
-def _table_line(row: dict, best: dict) -> str:
-    time, peer = _number(row, "ms_per_pair"), best.get((row["work"], row["n"]))
-    ratio = f"{peer / time:.1f} times" if time and peer and _is_ours(row) else ""
-    method = row["method"] + (f" ({row['status']})" if row["status"] != "measured" else "")
-    cells = [row["n"], row["m"], row["pairs"], method, row["dtype"], row["devices"], row["processes"]]
-    for name, style in (("gap_certified", ".1e"), ("settled", ".3f"), ("compile_s", ".1f"), ("seconds", ".3g")):
-        value = _number(row, name)
-        cells.append("" if value is None else format(value, style))
-    return "| " + " | ".join([*cells, f"{time:.3g}" if time else "", ratio]) + " |"
-
-
-def _peak_table(rows: list[dict]) -> list[str]:
-    found = [row for row in rows if row["work"] in ("peak", "one PDHG iteration")]
-    if not found:
-        return []
-    lines = ["## Distance from the machine's peak", "", "| work | n | type | us | GFLOP/s | of the peak | GB/s |"]
-    lines.append("|" + "---|" * 7)
-    for row in found:
-        fraction, rate = _number(row, "peak_fraction"), _number(row, "gbytes_per_s")
-        cells = [f"{row['work']}: {row['method']}", row["n"], row["dtype"], f"{1e6 * float(row['seconds']):.3g}"]
-        cells += [f"{float(row['gflops']):.3g}", f"{fraction:.1%}" if fraction else "", f"{rate:.3g}" if rate else ""]
-        lines.append("| " + " | ".join(cells) + " |")
-    return [*lines, ""]
-
-
-def curves(rows: list[dict], work: str, by: str) -> dict[str, list[tuple[int, float]]]:
-    """For each method and type, (rows' `by`, ms per pair)."""
-    found: dict[str, list[tuple[int, float]]] = {}
-    for row in rows:
-        if row["work"] == work and row["status"] == "measured" and (_number(row, "settled") or 0.0) >= _MIN_SETTLED:
-            name = row["method"].replace("_", " ") + (", float32" if row["dtype"] == "float32" else "")
-            found.setdefault(name, []).append((int(row[by]), float(row["ms_per_pair"])))
-    return {name: sorted(points) for name, points in found.items()}
-
-
-def plot(rows: list[dict], path: pathlib.Path) -> None:
-    """Time per pair against the size of the models and against the number of pairs, all axes logarithmic."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    panels = (
-        ("brackets", "n", "states of each model (n = m)", "the more states"),
-        ("counts", "pairs", "pairs of five states", "the more pairs"),
-    )
-    styles: dict[str, dict] = {}
-    figure, all_axes = plt.subplots(1, 2, figsize=(10.4, 4.4), layout="constrained", sharey=True)
-    for axes, (work, by, label, title) in zip(all_axes, panels, strict=True):
-        for name, points in curves(rows, work, by).items():
-            k = len(styles)
-            line = "-" if name.startswith("jaxhom") else "--"
-            style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "linestyle": line}
-            axes.loglog(*zip(*points, strict=True), label=name, **styles.setdefault(name, style))
-        ticks = sorted({at for points in curves(rows, work, by).values() for at, _ in points})
-        axes.set_xticks(ticks, [str(at) for at in ticks])
-        axes.minorticks_off()
-        axes.set(xlabel=label, title=title)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    all_axes[0].set_ylabel("milliseconds per pair")
-    figure.suptitle("Certified brackets of 1e-4, random pairs with 4 actions, two cores")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
-
-
-def report(path: pathlib.Path) -> None:
-    """The table and the figure of the rows in a CSV file, beside it."""
-    rows = read(path)
-    path.with_suffix(".md").write_text(table(rows))
-    if curves(rows, "brackets", "n"):
-        plot(rows, path.with_suffix(".png"))
-
-
-def similarity(arguments: argparse.Namespace) -> None:
-    """Measures, writes rows after every section, and reports."""
+def run(arguments: argparse.Namespace) -> None:
+    """Measures, writes rows after each of them, and reports."""
+    kind, path = KINDS[arguments.kind], arguments.output
     if not arguments.report:
-        wanted = arguments.sections or (QUICK if arguments.quick else SIMILARITY)
-        rows = read(arguments.output) if arguments.sections and arguments.output.exists() else []
+        methods = getattr(arguments, "methods", None)
+        wanted = arguments.sections or (kind.quick if arguments.quick else kind.sections)
+        stays = path.exists() and (arguments.sections or methods)
+        rows = speed_rows.read(path) if stays else []
         for section in wanted:
             print(section, file=sys.stderr, flush=True)
-            found = run_section(section, arguments.quick)
-            rows = [row for row in rows if row["section"] != section] + found
-            rows.sort(key=lambda row: SIMILARITY.index(row["section"]))
-            write(arguments.output, rows)
-    report(arguments.output)
+            rows = speed_rows.replace_rows(rows, section, methods)
+            for row in speed_rows.measure(kind, section, _options(arguments)):
+                rows.append(row)
+                rows.sort(key=lambda row: kind.sections.index(row["section"]))
+                speed_rows.write(path, rows, kind.fields)
+    kind.report(speed_rows.read(path), path)
+
+
+def _options(arguments: argparse.Namespace) -> list[str]:
+    options = ["--quick"] * arguments.quick
+    if getattr(arguments, "methods", None):
+        options += ["--methods", *arguments.methods]
+    if getattr(arguments, "limit", None):
+        options += ["--limit", str(arguments.limit)]
+    return options
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.speed", description="Benchmarks of speed.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    command = commands.add_parser("similarity", help="local and global homomorphisms, against other LP solvers")
-    command.add_argument("--quick", action="store_true", help="a handful of pairs, to see that it runs")
-    command.add_argument("--sections", nargs="+", choices=SIMILARITY, help="only these; rows of others stay")
-    command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
-    command.add_argument("--output", type=pathlib.Path, default=pathlib.Path("bench/results/speed_similarity.csv"))
-    command.set_defaults(run=similarity)
-    arguments = parser.parse_args()
-    arguments.run(arguments)
+    commands = parser.add_subparsers(dest="kind", required=True)
+    for name, kind in KINDS.items():
+        command = commands.add_parser(name, help=kind.title)
+        command.add_argument("--quick", action="store_true", help="a few small instances, to see that it runs")
+        command.add_argument("--sections", nargs="+", choices=kind.sections, help="only these; rows of others stay")
+        command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
+        command.add_argument("--output", type=pathlib.Path, default=pathlib.Path(f"bench/results/speed_{name}.csv"))
+        if kind.has_methods:
+            command.add_argument("--methods", nargs="+", help="only those whose names begin so; rows of others stay")
+            command.add_argument("--limit", type=float, help="seconds that a measurement may take")
+    run(parser.parse_args())
 
 
 if __name__ == "__main__":

@@ -1,0 +1,131 @@
+"""The tables and the figure of planning's speed, from the rows of `bench.planning_speed` alone."""
+
+import pathlib
+
+from bench.speed_rows import COLOURS, MARKERS, Kind, number
+
+SECTIONS = (
+    *("grid16", "grid32", "grid48", "grid100", "grid316"),
+    *("racetrack_a", "garnet_dense", "garnet_sparse"),
+)
+QUICK = ("grid16", "garnet_sparse")
+WORKS = {
+    "planning": "The value of an optimal policy",
+    "occupancy": "Occupancies of a policy",
+    "policy_value": "The value of a policy",
+}
+FIELDS = (
+    *("section", "instance", "work", "S", "A", "lanes", "method", "processes", "dtype", "device"),
+    *("seconds", "compile_s", "build_s", "error_asked", "error", "settled", "iterations"),
+    *("status", "note", "versions", "commit"),
+)
+
+
+def is_ours(row: dict) -> bool:
+    """Whether a row is of this library."""
+    return row["method"].startswith("jaxhom")
+
+
+def is_batch(row: dict) -> bool:
+    """Whether a row is of several rewards or policies."""
+    return (number(row, "lanes") or 1) > 1
+
+
+def is_settled(row: dict) -> bool:
+    """Whether a row has a time, and its worst lane the accuracy that was asked for."""
+    return row["status"] == "measured" and number(row, "settled") == 1.0
+
+
+def best_peers(rows: list[dict]) -> dict[tuple[str, str, bool], float]:
+    """Least seconds per lane of the peers that are accurate enough, by section, work and whether in a batch."""
+    best: dict[tuple[str, str, bool], float] = {}
+    for row in rows:
+        if not is_ours(row) and is_settled(row):
+            key = (row["section"], row["work"], is_batch(row))
+            best[key] = min(best.get(key, float("inf")), number(row, "seconds"))
+    return best
+
+
+def table(rows: list[dict]) -> str:
+    """A Markdown table for each kind of work: methods by rows, one lane and a batch."""
+    best = best_peers(rows)
+    lines = ["# Speed of planning and of occupancies", "", "Made from the rows of the CSV file of the same name."]
+    lines += ["Seconds per lane on the machine's two cores, compilation apart; errors are the worst lane's.", ""]
+    for work, title in WORKS.items():
+        order = {section: k for k, section in enumerate(SECTIONS)}
+        members = [row for row in rows if row["work"] == work]
+        members.sort(key=lambda row: (order[row["section"]], not is_ours(row), row["method"], is_batch(row)))
+        if not members:
+            continue
+        lines += [f"## {title}", ""]
+        lines += ["| instance | S | lanes | method | s | error | to best peer | compile s |"]
+        lines += ["|:--|--:|--:|:--|--:|--:|--:|--:|"] + [_line(row, best) for row in members] + [""]
+    failed = [row for row in rows if row["work"] not in WORKS]
+    lines += [f"{row['section']}: {row['status']}, {row['note']}" for row in failed]
+    return "\n".join(lines)
+
+
+def _line(row: dict, best: dict) -> str:
+    seconds, error, compile_s = (number(row, name) for name in ("seconds", "error", "compile_s"))
+    peer = best.get((row["section"], row["work"], is_batch(row)))
+    time = row["status"] if seconds is None else f"{seconds:.3g}" + ("" if is_settled(row) else " (inaccurate)")
+    ratio = f"{peer / seconds:.2g} times" if peer and seconds and is_ours(row) and is_settled(row) else ""
+    cells = [row["instance"], row["S"], row["lanes"], row["method"], time, "" if error is None else f"{error:.1e}"]
+    return "| " + " | ".join([*cells, ratio, f"{compile_s:.1f}" if compile_s is not None else ""]) + " |"
+
+
+def curves(rows: list[dict], work: str) -> dict[tuple[str, bool], list[tuple[int, float]]]:
+    """For each method, alone and in a batch, (S, seconds per lane) of the grids."""
+    found: dict[tuple[str, bool], list[tuple[int, float]]] = {}
+    for row in rows:
+        if row["work"] == work and row["section"].startswith("grid") and is_settled(row):
+            point = (int(row["S"]), number(row, "seconds"))
+            found.setdefault((row["method"], is_batch(row)), []).append(point)
+    return {name: sorted(points) for name, points in found.items()}
+
+
+def plot(rows: list[dict], path: pathlib.Path) -> None:
+    """Seconds per lane against the grids' states, a panel for each kind of work; batches dashed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    works = [work for work in WORKS if curves(rows, work)]
+    figure, all_axes = plt.subplots(1, len(works), figsize=(5.2 * len(works), 4.6), squeeze=False, layout="constrained")
+    for axes, work in zip(all_axes[0], works, strict=True):
+        lines = curves(rows, work)
+        methods = list(dict.fromkeys(method for method, _ in lines))
+        for (method, batch), points in lines.items():
+            k = methods.index(method)
+            style = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "markersize": 5}
+            label = method.replace("_", " ") + (", batch" if batch else "")
+            axes.loglog(*zip(*points, strict=True), label=label, linestyle="--" if batch else "-", **style)
+        ticks = sorted({states for points in lines.values() for states, _ in points})
+        axes.set_xticks(ticks, [f"{states:,}" for states in ticks])
+        axes.minorticks_off()
+        axes.set(xlabel="states", title=WORKS[work])
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
+    all_axes[0, 0].set_ylabel("seconds per lane")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def report(rows: list[dict], path: pathlib.Path) -> None:
+    """The tables and the figure, beside the CSV file."""
+    path.with_suffix(".md").write_text(table(rows))
+    if curves(rows, "planning"):
+        plot(rows, path.with_suffix(".png"))
+
+
+KIND = Kind(
+    title="planning and occupancies, against MDP toolboxes and SciPy",
+    module="planning_speed",
+    sections=SECTIONS,
+    quick=QUICK,
+    fields=FIELDS,
+    shown=("work", "method", "lanes", "seconds", "settled", "status", "note"),
+    report=report,
+    has_methods=True,
+)

@@ -11,6 +11,7 @@ first is taken, so rounding does not decide.
 """
 
 import functools
+from collections.abc import Callable
 
 import chex
 import jax
@@ -20,7 +21,7 @@ from jaxhom import checks
 from jaxhom.mdp import MDP, expected_next_value, expected_next_values
 from jaxhom.policy_chain import action_chains, saves_gathers
 
-_BLOCK = 8  # sweeps per look at the bounds
+_BLOCK = 16  # sweeps per look at the bounds
 _STALL = 16.0  # a span of this many roundings of the largest value is taken for converged
 
 
@@ -143,16 +144,10 @@ def _plan(mdp, reward, value, tolerance, *, max_iterations) -> Plan:
 def _iterate(mdp: MDP, reward, value, tolerance, max_iterations) -> tuple[jax.Array, jax.Array]:
     """Sweeps until half the span of the change is within the tolerance on every lane; value and sweeps per lane.
 
-    The bounds are looked at once per block of sweeps only: two reductions cost more than a sweep.
+    Modified policy iteration (Puterman 1994, section 6.5): a sweep over all actions, whose change gives the bounds,
+    then a block of sweeps with the actions that it chose.
     """
-
-    if mdp.is_dense or not saves_gathers(mdp.edges, mdp.narrow_width):
-        expected = functools.partial(expected_next_values, mdp)
-    else:
-        expected = action_chains(mdp.edges, mdp.probability).expected_next_values
-
-    def sweep(_, value):
-        return functools.reduce(jnp.maximum, [reward[:, a] + mdp.discount * v for a, v in enumerate(expected(value))])
+    improve, best_action, follow, evaluate = _sweeps(mdp, reward)
 
     def is_active(residual, count):
         return (residual > tolerance) & (count < max_iterations)
@@ -160,28 +155,77 @@ def _iterate(mdp: MDP, reward, value, tolerance, max_iterations) -> tuple[jax.Ar
     def block(state):
         value, residual, iterations, count = state
         active = is_active(residual, count)
-        length = jnp.where(count == 0, 1, jnp.minimum(_BLOCK, max_iterations - count))
-        swept = jax.lax.fori_loop(0, length - 1, sweep, value)
-        improved = sweep(None, swept)
-        change = improved - swept
+        # A loop of one pass, which XLA does not know: what a loop returns is computed once. Otherwise every use of
+        # the sweep's result would sweep again.
+        once = jnp.minimum(1, max_iterations - count)
+        improved = jax.lax.fori_loop(0, once, lambda _, v: improve(v), value)
+        change = improved - value
         low, high = change.min(axis=0), change.max(axis=0)
-        # A constant offset has no effect on the span; taking it out at once keeps the values at their scale.
-        centred = improved + mdp.discount / (1.0 - mdp.discount) * 0.5 * (low + high)
         # A span that rounding alone could make counts as zero: sweeping on would never reduce it.
         floor = _STALL * jnp.finfo(value.dtype).eps * jnp.abs(improved).max(axis=0)
         span = jnp.where(high - low > floor, high - low, 0.0)
-        return (
-            jnp.where(active, centred, value),
-            jnp.where(active, 0.5 * span, residual),
-            iterations + jnp.where(active, length, 0),
-            count + length,
-        )
+        residual = jnp.where(active, 0.5 * span, residual)
+        # A constant offset has no effect on the span; taking it out at once keeps the values at their scale.
+        centred = improved + mdp.discount / (1.0 - mdp.discount) * 0.5 * (low + high)
+        goes_on = is_active(residual, count + 1)
+        length = jnp.where(jnp.any(goes_on), jnp.minimum(_BLOCK, max_iterations - count) - 1, 0)
+        action = jax.lax.fori_loop(0, once, lambda *_: best_action(value, improved), jnp.zeros(value.shape, jnp.int32))
+        policy = follow(action)
+        evaluated = jax.lax.fori_loop(0, length, lambda _, v: evaluate(policy, v), centred)
+        value = jnp.where(active, jnp.where(goes_on, evaluated, centred), value)
+        return value, residual, iterations + jnp.where(active, 1 + jnp.where(goes_on, length, 0), 0), count + 1 + length
 
     lanes = reward.shape[2:]
     start = (value, jnp.full(lanes, jnp.inf, reward.dtype), jnp.zeros(lanes, jnp.int32), jnp.zeros((), jnp.int32))
     keep_going = lambda state: jnp.any(is_active(state[1], state[3]))  # noqa: E731
     value, _, iterations, _ = jax.lax.while_loop(keep_going, block, start)
     return value, iterations
+
+
+def _sweeps(mdp: MDP, reward: jax.Array) -> tuple[Callable, ...]:
+    """What the iteration is made of, for rewards [S, A] or, batch last, [S, A, B].
+
+    improve: value -> its backup by the best actions.
+    best_action: value, its backup -> the first of these actions, int32.
+    follow: actions -> their policy, as `evaluate` takes it.
+    evaluate: policy, value -> the backup under the policy.
+
+    A policy is what its sweep adds up: rewards [S], and weights [U, S] on the edges of the graph. In batches, where
+    every lane would have weights of its own, memory is the limit: the sweep over all actions, whose weights all lanes
+    share, is as fast, and does better. So it is where actions lead to different states.
+    """
+    rewards = jax.lax.optimization_barrier(jnp.moveaxis(reward, 1, 0))  # each action's in one piece
+    if mdp.is_dense or not saves_gathers(mdp.edges, mdp.narrow_width):
+        chains, expected = None, functools.partial(expected_next_values, mdp)
+    else:
+        chains = action_chains(mdp.edges, mdp.probability)
+        expected = chains.expected_next_values
+
+    def backups(value):
+        return [r + mdp.discount * v for r, v in zip(rewards, expected(value), strict=True)]
+
+    def improve(value):
+        return functools.reduce(jnp.maximum, backups(value))
+
+    if chains is None or reward.ndim == 3 or chains.wide_row.size:
+        return improve, lambda _, best: jnp.zeros(best.shape, jnp.int32), lambda _: None, lambda _, v: improve(v)
+
+    def best_action(value, improved):
+        numbered = reversed(list(enumerate(backups(value))))
+        action = jnp.zeros(improved.shape, jnp.int32)
+        return functools.reduce(lambda action, new: jnp.where(new[1] >= improved, new[0], action), numbered, action)
+
+    def follow(action):
+        def choose(options):
+            return functools.reduce(lambda old, new: jnp.where(action == new[0], new[1], old), enumerate(options), 0.0)
+
+        return choose(rewards), mdp.discount * choose(chains.weight)
+
+    def evaluate(policy, value):
+        r, weight = policy
+        return r + sum(w * value[states] for w, states in zip(weight, chains.successor, strict=True))
+
+    return improve, best_action, follow, evaluate
 
 
 def _tie_rounding(action_value: jax.Array) -> jax.Array:

@@ -1,7 +1,5 @@
 """The policies that LPAL on columns has met, shared by all lanes: what one lane has found may serve another."""
 
-import threading
-
 import jax
 import numpy as np
 
@@ -11,7 +9,7 @@ _FIRST_SIZE = 64
 
 
 class PolicyPool:
-    """Policies with their occupancies and feature expectations; safe to use from several threads.
+    """Policies with their occupancies and feature expectations.
 
     Deterministic policies are kept as actions, and every occupancy as that of the states: S numbers and S actions.
     """
@@ -21,7 +19,6 @@ class PolicyPool:
         self._action_dtype = np.min_scalar_type(mdp.num_actions - 1)
         self._expected = np.zeros((_FIRST_SIZE, mdp.num_features), self._dtype)
         self._policies: list[tuple[np.ndarray, np.ndarray]] = []
-        self._lock = threading.Lock()
 
     @property
     def expected(self) -> np.ndarray:
@@ -31,13 +28,12 @@ class PolicyPool:
     def add(self, occupancy: np.ndarray, policy: np.ndarray, expected: np.ndarray) -> int:
         """Takes a policy, given by actions [S] or probabilities [S, A], with mu [S] and V [K]; returns its number."""
         policy = policy.astype(self._action_dtype if policy.ndim == 1 else self._dtype)
-        with self._lock:
-            number = len(self._policies)
-            if number == len(self._expected):
-                self._expected = np.concatenate([self._expected, np.zeros_like(self._expected)])
-            self._expected[number] = expected
-            self._policies.append((occupancy.copy(), policy))
-            return number
+        number = len(self._policies)
+        if number == len(self._expected):
+            self._expected = np.concatenate([self._expected, np.zeros_like(self._expected)])
+        self._expected[number] = expected
+        self._policies.append((occupancy.copy(), policy))
+        return number
 
     def mixture(self, numbers: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         """The occupancy sum_j q_j x_j [S, A] of policies mixed with the given probabilities."""

@@ -1,0 +1,60 @@
+"""Best responses of LPAL on columns: the policy that is worth most for given weights, and its feature expectations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom.lpal.certificate import bound_by_planning
+from jaxhom.mdp import MDP
+from jaxhom.occupancy import rough_state_occupancy
+
+
+def with_compact_features(mdp: MDP) -> MDP:
+    """The model with features [S, 1, K] where they do not depend on the action: a quarter of the numbers, with four."""
+    features = np.asarray(mdp.features)
+    depends = (features != features[:, :1]).any()
+    return mdp if depends else mdp.replace(features=jnp.asarray(features[:, :1]))
+
+
+@jax.jit
+def respond(mdp: MDP, expectations, weights, value, accuracy, error) -> dict[str, jax.Array]:
+    """The best responses to weights, and the bounds that they prove.
+
+    Args:
+      mdp: the model; its features may be [S, 1, K].
+      expectations, weights: [L, K].
+      value: [L, S], a start for planning.
+      accuracy: [L], a gap that planning may be a tenth of; infinite where nothing is asked for.
+      error: scalar, what an expected feature may be off by.
+
+    Returns:
+      weights [L, K] and margin_bound [L]; value [L, S]; actions [L, S]; occupancy of the states [L, S] and expected
+      features [L, K] of these actions.
+    """
+    bound, plan = bound_by_planning(mdp, expectations, weights, value, accuracy)
+    mu, expected = _expected_features(mdp, plan.policy, jnp.where(jnp.isfinite(accuracy), error, jnp.inf))
+    return {
+        "weights": bound.weights,
+        "margin_bound": bound.margin_bound,
+        "value": plan.value,
+        "actions": plan.policy.argmax(axis=-1),
+        "occupancy": mu.T,
+        "expected": expected,
+    }
+
+
+@jax.jit
+def evaluate(mdp: MDP, policy) -> tuple[jax.Array, jax.Array]:
+    """State occupancy [S] and feature expectations [K] of a policy [S, A]."""
+    mu, expected = _expected_features(mdp, policy[None], 0.0)
+    return mu[:, 0], expected[0]
+
+
+def _expected_features(mdp, policy, error):
+    """State occupancies [S, L] and feature expectations [L, K] of policies [L, S, A], up to `error` [L]."""
+    largest = jnp.abs(mdp.features).max()
+    residual = error * (1.0 - mdp.discount) / (jnp.sqrt(mdp.num_states) * jnp.where(largest > 0, largest, 1.0))
+    mu = rough_state_occupancy(mdp, jnp.moveaxis(policy, 0, -1), residual)
+    if mdp.features.shape[1] == 1:
+        return mu, mu.T @ mdp.features[:, 0]
+    return mu, jnp.einsum("sl,lsa,sak->lk", mu, policy, mdp.features)

@@ -1,10 +1,10 @@
 """Optimal policies for one reward or a batch of rewards over the same model.
 
-Value iteration V <- max_a (r + gamma T V) with MacQueen's bounds (Puterman 1994, section 6.6.2): with
-b = T V - V, the optimal value lies between T V + gamma / (1 - gamma) min b and T V + gamma / (1 - gamma) max b.
-The iteration stops when the span max b - min b is small, which on a model that mixes is far earlier than |b|,
-and the value is then shifted by the constant that halves what is left, so the Bellman residual that is returned
-is half the span.
+Modified policy iteration (Puterman 1994, section 6.5): sweeps V <- max_a (r + gamma T V), and between two of them a
+block of cheaper ones under the actions that were chosen. It ends by MacQueen's bounds (section 6.6.2): with
+b = T V - V, the optimal value lies between T V + gamma / (1 - gamma) min b and T V + gamma / (1 - gamma) max b. The
+iteration stops when the span max b - min b is small, which on a model that mixes is far earlier than |b|, and the value
+is then shifted by the constant that halves what is left, so the Bellman residual that is returned is half the span.
 
 Ties are broken towards the lowest action: of the actions whose value is within `tie_tolerance` of the best, the
 first is taken, so rounding does not decide.
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from jaxhom import checks
 from jaxhom.mdp import MDP, expected_next_value, expected_next_values
+from jaxhom.planning_sensitivity import with_derivatives
 from jaxhom.policy_chain import action_chains, saves_gathers
 
 _BLOCK = 16  # sweeps per look at the bounds
@@ -28,6 +29,9 @@ _STALL = 16.0  # a span of this many roundings of the largest value is taken for
 @chex.dataclass(frozen=True)
 class Plan:
     """An optimal policy and what certifies it; with a batch of B rewards every field gains a leading axis [B].
+
+    Under `jax.grad` and `jax.jvp` value and action_value have derivatives (`jaxhom.planning_sensitivity`); the rest is
+    constant.
 
     Attributes:
       policy: [S, A], deterministic (one-hot).
@@ -93,7 +97,8 @@ def optimal_policy(
     if tolerance is None:
         tolerance = (1e-10 if mdp.dtype == jnp.float64 else 1e-5) * scale
     tolerance = jnp.broadcast_to(jnp.asarray(tolerance, mdp.dtype), scale.shape)
-    plan = _plan(mdp, jnp.moveaxis(reward, 0, -1), initial_value.T, tolerance, max_iterations=max_iterations)
+    inputs = jax.lax.stop_gradient((mdp, jnp.moveaxis(reward, 0, -1), initial_value.T, tolerance))
+    plan = with_derivatives(mdp, reward, _plan(*inputs, max_iterations=max_iterations))
     return plan if is_batch else jax.tree.map(lambda leaf: leaf[0], plan)
 
 

@@ -242,6 +242,25 @@ def test_float32_bounds_hold_where_features_hardly_differ(seed):
         np.testing.assert_allclose(solution.margin[i], best, rtol=1e-6, atol=1e-3)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_warm_starts(method):
+    """From a solution for other expectations: one for all lanes, or one for each."""
+    here = dense(6)
+    former = lpal(here.mdp, 1.01 * here.expectations, tolerance=1e-4, method=method)
+    for start in (former, lane(former, 2)):
+        solution = lpal(here.mdp, here.expectations, tolerance=1e-4, method=method, warm_start=start)
+        for i, expectations in enumerate(here.expectations):
+            assert_solved(lane(solution, i), here.arrays, expectations, 1e-4)
+
+
+def test_a_warm_start_saves_columns():
+    here = grid(8)
+    cold = lpal(here.mdp, here.expectations["perturbed"], tolerance=1e-2)
+    again = lpal(here.mdp, here.expectations["perturbed"], tolerance=1e-2, warm_start=cold)
+    assert again.iterations <= 2 < cold.iterations
+    assert_solved(again, here.arrays, here.expectations["perturbed"], 1e-2)
+
+
 # ---------------------------------------------------------------------------------- limits, options
 
 
@@ -339,6 +358,22 @@ def test_initial_policies_that_do_not_fit_are_refused(initial_policy, message):
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         lpal(dense(6).mdp, np.zeros(6), **options)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda former: "solution", "warm_start must be an LPALSolution, got str"),
+        (lambda former: former.replace(weights=np.ones(5)), r"warm_start.weights must have shape \(8, K\), got \(5,\)"),
+        (lambda former: former.replace(weights=np.ones(6)), "sum of warm_start.weights must be 1"),
+        (lambda former: former.replace(policy=former.policy[:3]), r"initial_policy must have shape \(8, S, A\)"),
+    ],
+)
+def test_warm_starts_that_do_not_fit_are_refused(change, message):
+    here = dense(6)
+    former = lpal(here.mdp, here.expectations, tolerance=1e-4)
+    with pytest.raises(ValueError, match=message):
+        lpal(here.mdp, here.expectations, warm_start=change(former))
 
 
 def test_a_model_without_features_is_refused():

@@ -36,6 +36,7 @@ def lpal(
     expectations: jax.Array,
     *,
     initial_policy: jax.Array | None = None,
+    warm_start: LPALSolution | None = None,
     tolerance: float | None = None,
     method: str = "columns",
     max_iterations: int | None = None,
@@ -48,6 +49,8 @@ def lpal(
       expectations: [K] or a batch [B, K], discounted feature expectations Vhat of the expert, in the units of
         `feature_expectations` (sums over time, not averages per step). No policy need reach them.
       initial_policy: [S, A] or [B, S, A], a good guess: the policy that the expectations came from, for one.
+      warm_start: a former solution for similar expectations or a similar model, of one lane or of as many as there are
+        expectations: its weights and, unless `initial_policy` is given, its policy are where to begin.
       tolerance: largest certified gap margin_bound - margin to settle for; by default
         1e-5 / (1 - discount) times the largest |feature|.
       method: "columns"; "interior_point", far faster where features are many and do not overlap, on models whose graph
@@ -66,7 +69,7 @@ def lpal(
 
     Raises:
       ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
-        distributions, a model without features, an unknown method, a model too large for method "flow"; under jit or
+        distributions, a warm start that is none, a model without features, an unknown method, a model too large for method "flow"; under jit or
         vmap; on second derivatives.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
@@ -76,8 +79,8 @@ def lpal(
     if not mdp.num_features:
         raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
     inputs = (mdp, expectations)
-    mdp, expectations, initial_policy = without_tangents((mdp, expectations, initial_policy))
-    if checks.is_traced(mdp, expectations, initial_policy):
+    mdp, expectations, initial_policy, warm_start = without_tangents((mdp, expectations, initial_policy, warm_start))
+    if checks.is_traced(mdp, expectations, initial_policy, warm_start):
         raise ValueError("lpal adds columns on the host: call it outside jit and vmap, in batches [B, K]")
     host = checks.as_host_array("expectations", expectations)
     good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features and host.size > 0
@@ -85,23 +88,43 @@ def lpal(
     host = checks.require_floats("expectations", host)
     reduction = reduce_expectations(mdp, np.atleast_2d(host))
     batch = jnp.asarray(reduction.expectations, mdp.dtype)
+    options = {"progress": progress}
+    if warm_start is not None:
+        _require_solution(warm_start)
+        if initial_policy is None:
+            initial_policy = warm_start.policy
+        if method == "columns":
+            options["initial_weights"] = _guess("warm_start.weights", warm_start.weights, batch)
     if initial_policy is not None:
         initial_policy = checks.as_host_array("initial_policy", initial_policy)
         check_policy_shape(mdp, initial_policy, "initial_policy")
-        fits = initial_policy.ndim == 2 or len(initial_policy) == len(batch)
-        checks.require_shape("initial_policy", initial_policy, f"({len(batch)}, S, A)", fits)
-        initial_policy = checks.require_distribution("initial_policy", initial_policy)
-        shape = (len(batch), *initial_policy.shape[-2:])
-        initial_policy = jnp.broadcast_to(jnp.asarray(initial_policy, mdp.dtype), shape)
+        initial_policy = _guess("initial_policy", initial_policy, batch)
     if tolerance is None:
         scale = float(jnp.abs(mdp.features).max())
         tolerance = 1e-5 / (1.0 - float(mdp.discount)) * (scale or 1.0)
     elif not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
-    options = {} if max_iterations is None else {"max_iterations": max_iterations}
-    solution = _METHODS[method](mdp, batch, initial_policy, tolerance, progress=progress, **options)
+    if max_iterations is not None:
+        options["max_iterations"] = max_iterations
+    solution = _METHODS[method](mdp, batch, initial_policy, tolerance, **options)
     solution = restore(solution, reduction, tolerance)
     if checks.is_traced(inputs):
         mdp, expectations = inputs
         solution = with_derivatives(solution, mdp, jnp.atleast_2d(jnp.asarray(expectations, mdp.dtype)))
     return solution if host.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], solution)
+
+
+def _require_solution(warm_start) -> None:
+    if not isinstance(warm_start, LPALSolution):
+        raise ValueError(f"warm_start must be an LPALSolution, got {type(warm_start).__name__}")
+
+
+def _guess(name: str, guess, batch: jax.Array) -> jax.Array:
+    """Distributions [..., n], one for all lanes of the batch or one for each, as [B, ..., n]."""
+    guess = checks.as_host_array(name, guess)
+    lane_ndim = 1 if name.endswith("weights") else 2
+    lane_shape = batch.shape[1:] if lane_ndim == 1 else guess.shape[-2:]
+    good = guess.shape[-lane_ndim:] == lane_shape and guess.shape[:-lane_ndim] in ((), (len(batch),))
+    checks.require_shape(name, guess, f"({len(batch)}, {'K' if lane_ndim == 1 else 'S, A'})", good)
+    guess = checks.require_distribution(name, guess)
+    return jnp.broadcast_to(jnp.asarray(guess, batch.dtype), (len(batch), *lane_shape))

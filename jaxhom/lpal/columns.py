@@ -33,6 +33,7 @@ from jaxhom.mdp import MDP
 from jaxhom.pdhg import Status
 
 _PULLS = (0.3, 0.7)  # shares of the best bound's weights in a query; the second where a core would be idle
+_FEW_FEATURES, _FEW_PULLS = 8, (0.0, 0.5)  # up to here the weights do not jump
 _LOOSE_GAME = 0.5  # share of the open gap that the game may leave
 _LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to the bound
 _SLACK = 0.02  # share of the tolerance that is left to columns that are not quite exact
@@ -150,6 +151,7 @@ class _Solver:
         self.mdp, self.pool = with_compact_features(mdp), PolicyPool(mdp)
         self.tolerance, self.width, self.workers, self.run = tolerance, width, workers, run
         self.room = largest_capacity(mdp.num_features)
+        self.pulls = _FEW_PULLS if mdp.num_features <= _FEW_FEATURES else _PULLS
 
     def start(self, number: int, expectations: np.ndarray, policies, weights) -> _Lane:
         """The lane of one problem; with a first column if there is a policy to begin with."""
@@ -163,9 +165,9 @@ class _Solver:
 
     def respond_to(self, lanes: list[_Lane]) -> None:
         """Best responses of every lane to its query: columns, and bounds."""
-        per_lane = max(1, min(len(_PULLS), self.workers // len(lanes)))
+        per_lane = max(1, min(len(self.pulls), self.workers // len(lanes)))
         is_first = lanes[0].row_probabilities is None
-        asked = [(lane, pull) for pull in _PULLS[: 1 if is_first else per_lane] for lane in lanes]
+        asked = [(lane, pull) for pull in self.pulls[: 1 if is_first else per_lane] for lane in lanes]
         chunks = self._chunks(asked)
         for chunk, answers in zip(chunks, self.run(self._respond, chunks), strict=True):
             for k, (lane, _) in enumerate(chunk):
@@ -208,7 +210,7 @@ class _Solver:
 
     def _join_from_pool(self, lane: _Lane) -> bool:
         """Adds the policies that are worth most at the query; False if none is worth much more than the lane's own."""
-        worth = (self.pool.expected - lane.expectations) @ lane.query(_PULLS[0])
+        worth = (self.pool.expected - lane.expectations) @ lane.query(self.pulls[0])
         limit = worth[lane.columns].max() + _WORTHWHILE * max(lane.gap, 0.0)
         best = np.argsort(worth)[-_FROM_POOL:]
         best = best[worth[best] > limit]

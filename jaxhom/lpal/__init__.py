@@ -69,8 +69,8 @@ def lpal(
 
     Raises:
       ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
-        distributions, a warm start that is none, a model without features, an unknown method, a model too large for method "flow"; under jit or
-        vmap; on second derivatives.
+        distributions, a warm start that is none, a model without features, an unknown method, a model too large for
+        method "flow"; under jit or vmap; on second derivatives.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
     """

@@ -13,7 +13,7 @@ from jaxhom.occupancy import occupancy
 from jaxhom.pdhg import Status
 from jaxhom.planning import Plan, optimal_policy
 
-_NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0
+NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0, for x that solvers leave near 0
 
 
 @chex.dataclass(frozen=True)
@@ -84,18 +84,18 @@ def better_bound(one: UpperBound, other: UpperBound) -> UpperBound:
     return jax.tree.map(choose, one, other)
 
 
-def policy_from_occupancy(mdp: MDP, x: jax.Array, fallback: jax.Array) -> jax.Array:
-    """pi(s, a) = x(s, a) / sum_a' x(s, a') (eq. 5), [B, S, A]; `fallback` where the state hardly occurs."""
+def policy_from_occupancy(mdp: MDP, x: jax.Array, fallback: jax.Array, negligible: float = NO_OCCUPANCY) -> jax.Array:
+    """pi(s, a) = x(s, a) / sum_a' x(s, a') (eq. 5), [B, S, A]; `fallback` where the state's share is negligible."""
     x = jnp.maximum(x, 0.0)
     total = x.sum(axis=-1, keepdims=True)
-    occurs = total > _NO_OCCUPANCY / (1.0 - mdp.discount)
+    occurs = total > negligible / (1.0 - mdp.discount)
     return jnp.where(occurs, x / jnp.where(occurs, total, 1.0), fallback)
 
 
 @jax.jit
-def certify(mdp, expectations, x, bound, tolerance, iterations, *, stopped) -> LPALSolution:
+def certify(mdp, expectations, x, bound, tolerance, iterations, *, stopped, negligible=NO_OCCUPANCY) -> LPALSolution:
     """The solution whose policy is read off the occupancy x [B, S, A]; `stopped` (or [B]) is that of an open gap."""
-    policy = policy_from_occupancy(mdp, x, bound.policy)
+    policy = policy_from_occupancy(mdp, x, bound.policy, negligible)
     true_occupancy = occupancy(mdp, policy)
     expected = jnp.einsum("bsa,sak->bk", true_occupancy, mdp.features)
     margin = (expected - expectations).min(axis=-1)

@@ -13,16 +13,20 @@ _MAX_NEWTON_SIZE = 256  # strategies of the player who has fewer; the normal mat
 _PDHG_ITERATIONS = 4096  # an inexact game still gives valid weights
 
 
-def largest_capacity(num_features: int) -> int:
-    """Columns that a game may have: twice as many as an optimal mixture can need, in a power of two."""
-    return max(_FIRST_CAPACITY, 1 << (2 * num_features - 1).bit_length())
+def capacities(num_features: int) -> list[int]:
+    """Numbers of columns that games are padded to, ascending: few, so that few programs are compiled.
+
+    An optimal mixture needs no more columns than there are features; the last has room for four times as many.
+    """
+    enough = 1 << (num_features - 1).bit_length()
+    return sorted({max(_FIRST_CAPACITY, times * enough) for times in (0, 2, 4)})
 
 
 def play(payoffs: list[np.ndarray], former, bounds, tolerance: float, share: float, width: int) -> GameSolution:
     """Solves games, loosely where much is open.
 
     Args:
-      payoffs: one [K, m] per game, m <= `largest_capacity`, which may differ between games.
+      payoffs: one [K, m] per game, m at most the largest of `capacities`; it may differ between games.
       former: (w [K], q [m]) per game, where to begin; zeros for nowhere.
       bounds: bounds on the values of the games over all policies.
       tolerance, share: a game is solved when its own gap is below the tolerance, or below this share of what is open
@@ -34,7 +38,7 @@ def play(payoffs: list[np.ndarray], former, bounds, tolerance: float, share: flo
     """
     num_features = len(payoffs[0])
     most = max(payoff.shape[1] for payoff in payoffs)
-    capacity = _FIRST_CAPACITY if most <= _FIRST_CAPACITY else largest_capacity(num_features)
+    capacity = next(capacity for capacity in capacities(num_features) if most <= capacity)
     dtype = payoffs[0].dtype
     stacked = np.zeros((width, num_features, capacity), dtype)
     start = np.zeros((width, num_features), dtype), np.zeros((width, capacity), dtype)

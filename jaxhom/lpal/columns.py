@@ -26,7 +26,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom.lpal.certificate import LPALSolution, UpperBound, certify
-from jaxhom.lpal.column_games import largest_capacity, play
+from jaxhom.lpal.column_games import capacities, play
 from jaxhom.lpal.policy_pool import PolicyPool
 from jaxhom.lpal.responses import evaluate, respond, with_compact_features
 from jaxhom.mdp import MDP
@@ -37,7 +37,8 @@ _FEW_FEATURES, _FEW_PULLS = 8, (0.0, 0.5)  # up to here the weights do not jump
 _LOOSE_GAME = 0.5  # share of the open gap that the game may leave
 _LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to the bound
 _SLACK = 0.02  # share of the tolerance that is left to columns that are not quite exact
-_PATIENCE = 20  # rounds without any progress, after which rounding has won
+_NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact, and many rare states add up
+_PATIENCE = 40  # rounds without any progress, after which rounding has won
 _YOUNG = 8  # newest columns, never dropped
 _FROM_POOL = 8  # policies of other lanes that join a game at a time
 _WORTHWHILE = 0.1  # share of the open gap by which they have to be better
@@ -150,7 +151,7 @@ class _Solver:
     def __init__(self, mdp: MDP, tolerance: float, width: int, workers: int, run: Callable):
         self.mdp, self.pool = with_compact_features(mdp), PolicyPool(mdp)
         self.tolerance, self.width, self.workers, self.run = tolerance, width, workers, run
-        self.room = largest_capacity(mdp.num_features)
+        self.room = capacities(mdp.num_features)[-1]
         self.pulls = _FEW_PULLS if mdp.num_features <= _FEW_FEATURES else _PULLS
 
     def start(self, number: int, expectations: np.ndarray, policies, weights) -> _Lane:
@@ -249,4 +250,5 @@ class _Solver:
         expectations = np.stack([lane.expectations for lane in padded])
         counts = np.array([lane.made for lane in padded], np.int32)
         stopped = np.where(counts >= max_iterations, Status.ITERATION_LIMIT, Status.STALLED)
-        return certify(mdp, expectations, x, bound, self.tolerance, counts, stopped=stopped)
+        options = {"stopped": stopped, "negligible": _NO_OCCUPANCY}
+        return certify(mdp, expectations, x, bound, self.tolerance, counts, **options)

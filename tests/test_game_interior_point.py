@@ -179,9 +179,7 @@ def test_a_start_near_the_solution_saves_steps(shape):
         payoff = rng.normal(size=shape)
         former = play(payoff, tolerance=1e-2)
         changed = payoff + 1e-3 * rng.normal(size=shape)
-        cold, warm = (
-            play(changed, tolerance=1e-2, start=start) for start in (None, (former.w, former.q))
-        )
+        cold, warm = (play(changed, tolerance=1e-2, start=start) for start in (None, (former.w, former.q)))
         assert_proved(warm, changed, 1e-8)
         assert warm.upper - warm.lower <= 1e-2
         saved.append(cold.steps - warm.steps)

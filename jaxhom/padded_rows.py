@@ -78,8 +78,10 @@ def gather_sum(index: jax.Array, weight: jax.Array, values: jax.Array) -> jax.Ar
       weight: [..., n], or [..., n, B] beside values of shape [S, B].
       values: [S] or [S, B].
     """
-    axis, values = index.ndim - 1, jnp.asarray(values)
+    axis = index.ndim - 1
     if index.shape[-1] > _MAX_UNROLL:
+        values = jnp.asarray(values)
+
         # A loop over blocks of terms, each one fused pass: the gathered numbers never go through memory.
         def blocks(array):
             padding = [(0, 0)] * array.ndim

@@ -8,7 +8,7 @@ import pytest
 
 from jaxhom.game_interior_point import solve_game
 
-SMALL, TALL = (8, 20), (64, 30)
+SMALL, TALL = (8, 20), (64, 30)  # a program each: tests differ in what stands in the arrays
 
 
 def solve(payoff, is_column, tolerance, share, bound, w, q):
@@ -93,13 +93,12 @@ def test_values(name, shape):
     assert_proved(solution, payoff, 1e-8)
 
 
-@pytest.mark.parametrize("shape", [(1, 6), (6, 1)], ids=str)
-def test_a_player_without_a_choice(shape):
+@pytest.mark.parametrize(("shape", "count", "best"), [((1, 6), 6, np.max), (SMALL, 1, np.min), (TALL, 1, np.min)])
+def test_a_player_without_a_choice(shape, count, best):
     payoff = np.random.default_rng(5).normal(size=shape)
-    solution = play(payoff, tolerance=1e-8)
-    assert_proved(solution, payoff, 1e-9)
-    expected = payoff.max() if shape[0] == 1 else payoff.min()
-    np.testing.assert_allclose([solution.lower, solution.upper], expected, rtol=0, atol=1e-8)
+    solution = play(payoff, count, tolerance=1e-8)
+    assert_proved(solution, payoff[:, :count], 1e-9)
+    np.testing.assert_allclose([solution.lower, solution.upper], best(payoff[:, :count]), rtol=0, atol=1e-8)
 
 
 def test_a_saddle_point_is_found():
@@ -192,9 +191,9 @@ def test_any_start_will_do(shape, scale):
     """Pure, wrong, not normalised, with weight on columns that do not exist: the bounds hold, the gap closes."""
     rows, columns = shape
     payoff, count = games(shape)["normal"], columns - 4
-    start = scale * np.eye(rows)[1], scale * (np.eye(columns)[0] + np.eye(columns)[-1])
-    for start in (start, (start[0], scale * np.eye(columns)[-1])):
-        solution = play(payoff, count, tolerance=1e-6, start=start)
+    w, first, gone = scale * np.eye(rows)[1], scale * np.eye(columns)[0], scale * np.eye(columns)[-1]
+    for q in (first, first + gone, gone):
+        solution = play(payoff, count, tolerance=1e-6, start=(w, q))
         assert_proved(solution, payoff[:, :count], 1e-8)
         assert solution.upper - solution.lower <= 1e-6
 

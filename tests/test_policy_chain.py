@@ -8,7 +8,7 @@ import small_models
 
 from jaxhom.policy_chain import action_chains, find_edges, policy_chain, saves_gathers
 
-# "absorbing" has edges of several actions, "sparse" rows of more than 16 predecessors, "restart" wide rows of both kinds.
+# In "absorbing" actions share edges, in "sparse" states have over 16 predecessors, "restart" has wide rows of both kinds.
 NAMES = ["absorbing", "sparse", "restart"]
 BATCH = 3
 
@@ -98,7 +98,7 @@ def test_products_follow_the_probabilities():
 def test_derivatives(name):
     """u . P_pi v is linear in probability and policy: its derivatives are written down from the dense model."""
     case = small_models.case(name)
-    policies, values, flows = inputs(case)
+    policies, values, flows = map(jnp.asarray, inputs(case))
     on_pairs = np.random.default_rng(3).normal(size=(*case.shape, BATCH))
 
     @jax.jit
@@ -118,7 +118,7 @@ def test_derivatives(name):
 
     *both, of_actions = gradients(case.mdp.probability, policies)
     next_state, is_used = np.asarray(case.mdp.next_state), np.asarray(case.mdp.probability) > 0
-    gathered = values[next_state]
+    gathered = np.asarray(values)[next_state]
     for by_probability, by_policy in both:
         expected = np.einsum("sb,sab,sanb->san", flows, policies, gathered)
         np.testing.assert_allclose(by_probability, np.where(is_used, expected, 0.0), rtol=0, atol=1e-12)

@@ -122,12 +122,12 @@ def test_games_of_different_lengths(solver, counts):
     assert (solution.upper - solution.lower)[: len(games)].max() <= 1e-5
 
 
-def test_short_games_stay_short():
-    games = payoffs((1, 7, 32, 20), num_features=2)
-    solution = play(games)
-    assert solution.q.shape == (WIDTH, 32)
-    assert_proved(solution, games)
-    assert (solution.upper - solution.lower)[:4].max() <= 1e-5
+def test_short_games_are_not_padded_to_the_largest_capacity(monkeypatch):
+    shapes = []
+    monkeypatch.setattr(column_games, "_by_interior_point", lambda payoff, *_: shapes.append(payoff.shape) or ())
+    for counts in ((1, 32), (1, 33)):
+        play(payoffs(counts))
+    assert shapes == [(WIDTH, 20, 32), (WIDTH, 20, 64)]
 
 
 def test_games_begin_where_they_are_told(solver):

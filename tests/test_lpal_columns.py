@@ -166,12 +166,14 @@ def expectations_around(case, count):
     return np.array(exact) * rng.uniform(0.7, 1.3, size=(count, case.features.shape[2]))
 
 
-def test_the_answer_is_the_same_twice_and_other_lanes_do_not_spoil_it():
-    """Twelve lanes, in more than one program if there is more than one core, share what they find.
+@pytest.mark.parametrize("name", ["sparse", "restart"])
+def test_the_answer_is_the_same_twice_and_other_lanes_do_not_spoil_it(name):
+    """Twelve lanes share what they find: in programs that call LAPACK, which two at a time would wait for each other
+    for ever ("sparse"), and in programs that run side by side if there is more than one core ("restart").
 
     Each is then solved beside copies of itself alone, and its certificate is held to the model in NumPy.
     """
-    case = small_models.case("restart")
+    case = small_models.case(name)
     expectations = expectations_around(case, 12)
     batch, again = (lpal(case.mdp, expectations, tolerance=TOLERANCE) for _ in range(2))
     jax.tree.map(np.testing.assert_array_equal, batch, again)

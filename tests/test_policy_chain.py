@@ -8,7 +8,7 @@ import small_models
 
 from jaxhom.policy_chain import action_chains, find_edges, policy_chain, saves_gathers
 
-# Actions share edges in "absorbing", states have over 16 predecessors in "sparse", "restart" has wide rows of both kinds
+# "absorbing": actions share edges; "sparse": over 16 predecessors in a row; "restart": wide rows of both kinds
 NAMES = ["absorbing", "sparse", "restart"]
 BATCH = 3
 

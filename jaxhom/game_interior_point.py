@@ -72,7 +72,8 @@ def solve_game(
     def is_enough(lower, upper):
         return upper - lower <= jnp.maximum(goal[0], jnp.where(goal[1] > 0, goal[1] * (bound - lower), 0.0))
 
-    w, q = (jnp.zeros(num_rows), jnp.zeros(num_columns)) if start is None else start
+    start = (0.0, 0.0) if start is None else start
+    w, q = (jnp.broadcast_to(jnp.asarray(s, payoff.dtype), n) for s, n in zip(start, payoff.shape, strict=True))
     if num_rows <= num_columns:
         w, q, steps = _iterate(payoff, is_row, is_column, (w, q), is_enough)
     else:  # the same game with the players' parts exchanged
@@ -104,6 +105,8 @@ def _iterate(payoff, is_row, is_column, former, is_enough):
 
 def _start(payoff, is_row, is_column, former):
     """The former strategies, or uniform ones, pulled inside; room in both slacks: w, q, v, t."""
+    # What a former game had and this one has not would stay in the sums for ever, and spoil the bounds.
+    former = tuple(jnp.where(mask, old, 0.0) for mask, old in zip((is_row, is_column), former, strict=True))
     is_warm = (former[0].sum() > 0) & (former[1].sum() > 0)
     uniform = tuple(mask / mask.sum().astype(payoff.dtype) for mask in (is_row, is_column))
     warm = jnp.where(is_warm, 1.0 - _WARM_START, 0.0)

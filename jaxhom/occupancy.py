@@ -119,7 +119,7 @@ def rough_state_occupancy(mdp: MDP, policy: jax.Array, residual: jax.Array) -> j
       mu [S, B]; NaN on lanes that missed the residual. Not to be differentiated.
     """
     initial = jnp.broadcast_to(mdp.initial[:, None], (mdp.num_states, policy.shape[2]))
-    if _is_small(mdp):
+    if is_solved_by_lu(mdp):
         return _solve_by_lu(mdp, policy, initial, transpose=True)
     forward, _ = _products(mdp, policy)
     return _solve_by_krylov(mdp.discount, forward, initial, residual)
@@ -127,7 +127,7 @@ def rough_state_occupancy(mdp: MDP, policy: jax.Array, residual: jax.Array) -> j
 
 def _solve_flow(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
     """Solves (I - gamma P_pi)^T mu = source; [S] or, batch last, [S, B]."""
-    if _is_small(mdp):
+    if is_solved_by_lu(mdp):
         return _solve_by_lu(mdp, policy, source, transpose=True)
     forward, backward = _products(mdp, policy)
     return _solve_implicitly(mdp.discount, forward, backward, source)
@@ -136,13 +136,14 @@ def _solve_flow(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
 @jax.jit
 def _solve_values(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
     """Solves (I - gamma P_pi) V = source; [S] or, batch last, [S, B]."""
-    if _is_small(mdp):
+    if is_solved_by_lu(mdp):
         return _solve_by_lu(mdp, policy, source, transpose=False)
     forward, backward = _products(mdp, policy)
     return _solve_implicitly(mdp.discount, backward, forward, source)
 
 
-def _is_small(mdp: MDP) -> bool:
+def is_solved_by_lu(mdp: MDP) -> bool:
+    """Whether LAPACK solves for this model's occupancies. Programs that call it must not run at the same time."""
     return mdp.num_states <= (_MAX_LU_STATES_DENSE if mdp.is_dense else _MAX_LU_STATES)
 
 

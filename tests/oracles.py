@@ -355,6 +355,22 @@ def occupancy_regression(transition, discount, initial, coordinates, trajectorie
 # --------------------------------------------------------------------------------------- LPAL
 
 
+def game_value(payoff):
+    """Value of the game of the row player w, who pays: min over w of max_j (M^T w)_j."""
+    rows, columns = payoff.shape
+    result = linprog(
+        np.append(np.zeros(rows), 1.0),
+        A_ub=np.hstack([payoff.T, -np.ones((columns, 1))]),
+        b_ub=np.zeros(columns),
+        A_eq=np.append(np.ones(rows), 0.0)[None],
+        b_eq=[1.0],
+        bounds=[(0, None)] * rows + [(None, None)],
+        method="highs",
+    )
+    assert result.success
+    return result.fun
+
+
 def lpal(transition, discount, initial, features, expectations):
     """LPAL (2)-(4) for Vhat = `expectations` [K]: (margin v*, occupancy x [S, A], weights w [K]).
 

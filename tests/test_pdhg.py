@@ -10,7 +10,6 @@ import numpy as np
 import oracles
 import pytest
 from jaxopt.projection import projection_l1_ball, projection_simplex
-from scipy.optimize import linprog
 
 from jaxhom.lane_queue import solve_many
 from jaxhom.pdhg import SOLVER, PDHGState, Status, engine, projections
@@ -19,22 +18,6 @@ from jaxhom.pdhg.matrix_game import MatrixGame
 from jaxhom.pdhg.projections import project_l1_ball, project_simplex, reduce_leading
 
 DTYPES = [np.float32, np.float64]
-
-
-def game_value(payoff):
-    """Value of the game of the row player w, who pays: min over w of max_j (M^T w)_j."""
-    rows, columns = payoff.shape
-    result = linprog(
-        np.append(np.zeros(rows), 1.0),
-        A_ub=np.hstack([payoff.T, -np.ones((columns, 1))]),
-        b_ub=np.zeros(columns),
-        A_eq=np.append(np.ones(rows), 0.0)[None],
-        b_eq=[1.0],
-        bounds=[(0, None)] * rows + [(None, None)],
-        method="highs",
-    )
-    assert result.success
-    return result.fun
 
 
 # ----------------------------------------------------------------------------------- projections
@@ -389,7 +372,7 @@ def test_game_bounds_of_feasible_points(dtype, rng):
     payoff[..., :2] = 0.1, -3.3
     is_column = np.arange(8)[:, None] < np.resize([8, 8, 1, 2, 4, 7], 16)
     game = matrix_game(payoff, is_column)
-    value = [game_value(payoff[:, is_column[:, b], b].astype(float)) for b in range(16)]
+    value = [oracles.game_value(payoff[:, is_column[:, b], b].astype(float)) for b in range(16)]
     rounding = 16 * np.finfo(dtype).eps * np.abs(payoff).max(axis=(0, 1)) + 1e-12
     for _ in range(5):
         w, q = rng.normal(size=(6, 16)).astype(dtype), rng.normal(size=(8, 16)).astype(dtype)
@@ -418,7 +401,7 @@ def games():
     num_columns = np.full(16, 8)
     num_columns[8] = 6
     num_columns[11:] = [1, 2, 3, 5, 7]
-    values = [game_value(payoff[:, : num_columns[b], b]) for b in range(16)]
+    values = [oracles.game_value(payoff[:, : num_columns[b], b]) for b in range(16)]
     return payoff, np.arange(8)[:, None] < num_columns, np.array(values)
 
 

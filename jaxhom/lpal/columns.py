@@ -30,6 +30,7 @@ from jaxhom.lpal.column_games import capacities, play
 from jaxhom.lpal.policy_pool import PolicyPool
 from jaxhom.lpal.responses import evaluate, respond, with_compact_features
 from jaxhom.mdp import MDP
+from jaxhom.occupancy import is_solved_by_lu
 from jaxhom.pdhg import Status
 
 _PULLS = (0.3, 0.7)  # shares of the best bound's weights in a query; the second where a core would be idle
@@ -60,7 +61,8 @@ def solve_by_columns(
     """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None, initial_weights [B, K] or None."""
     total = len(expectations)
     on_cpu = jax.default_backend() == "cpu"
-    workers = _num_cores() if on_cpu else 1
+    # Two programs that both call LAPACK can wait for each other for ever (see `jaxhom.inverse_factor`).
+    workers = _num_cores() if on_cpu and not is_solved_by_lu(mdp) else 1
     width = _NUMBERS_AT_A_TIME // mdp.num_states if on_cpu else _MAX_WIDTH
     width = min(max(1, width), _MAX_WIDTH, -(-total // workers))
     host = tuple(None if array is None else np.asarray(array) for array in (initial_policy, initial_weights))

@@ -77,7 +77,7 @@ class Rows:
         pattern = self._schur(abs(self._core), -abs(self._extra), np.ones(self.matrix.shape[1]))[0]
         self._order = reverse_cuthill_mckee(pattern.tocsr(), symmetric_mode=True)
         self._place = np.argsort(self._order)
-        self._bandwidth = int(np.abs(self._place[pattern.row] - self._place[pattern.col]).max())
+        self.bandwidth = int(np.abs(self._place[pattern.row] - self._place[pattern.col]).max())
 
     def factor(self, d: np.ndarray) -> None:
         """Factorises A diag(d) A^T bordered by B, for d [m] positive."""
@@ -85,7 +85,7 @@ class Rows:
         schur, self._cross, self._diagonal = self._schur(self._core, self._extra, d)
         row, column = self._place[schur.row], self._place[schur.col]
         lower = row >= column
-        band = np.zeros((self._bandwidth + 1, self.num_core))
+        band = np.zeros((self.bandwidth + 1, self.num_core))
         band[(row - column)[lower], column[lower]] = schur.data[lower]
         band[0] *= 1.0 + _REGULARISATION
         self._factor = scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)

@@ -1,6 +1,7 @@
 """LPAL against HiGHS: margins, bounds, and the certificates that they come with."""
 
 import functools
+import importlib
 from typing import NamedTuple
 
 import chex
@@ -14,7 +15,8 @@ import small_models
 from jaxhom import MDP, Status, gridworld, lpal
 from jaxhom.lpal.certificate import policy_from_occupancy
 
-METHODS = ["columns", "flow", "interior_point"]
+quickest = importlib.import_module("jaxhom.lpal.quickest")
+METHODS = ["columns", "flow", "interior_point", "auto"]
 
 
 class Instance(NamedTuple):
@@ -121,6 +123,21 @@ def test_a_gridworld(name, method):
     expectations, tolerance = here.expectations[name], 1e-2
     solution = lpal(here.mdp, expectations, tolerance=tolerance, method=method)
     assert_solved(solution, here.arrays, expectations, tolerance)
+
+
+@pytest.mark.parametrize("cut_short", [False, True])
+def test_columns_go_on_where_the_interior_point_stops(cut_short, monkeypatch):
+    """Sixteen regions of a grid are what the interior point is quick on."""
+    here, names = grid(8), ["perturbed", "of both signs"]
+    if cut_short:
+        stop = functools.partial(quickest.solve_by_interior_point, max_iterations=2)
+        monkeypatch.setattr(quickest, "solve_by_interior_point", stop)
+    expectations = np.stack([here.expectations[name] for name in names])
+    solution = lpal(here.mdp, expectations, tolerance=1e-2)
+    by_interior_point = lpal(here.mdp, expectations, tolerance=1e-2, method="interior_point")
+    assert np.array_equal(solution.iterations, by_interior_point.iterations) != cut_short
+    for i, name in enumerate(names):
+        assert_solved(lane(solution, i), here.arrays, here.expectations[name], 1e-2)
 
 
 @pytest.mark.parametrize("name", ["Monte Carlo", "perturbed", "of both signs"])
@@ -272,7 +289,7 @@ def test_one_iteration_gives_valid_bounds(method):
         assert_certified(lane(solution, i), here.arrays, expectations)
     open_gap = solution.margin_bound - solution.margin > 1e-9
     assert open_gap.sum() > 4
-    stopped = Status.STALLED if method == "interior_point" else Status.ITERATION_LIMIT
+    stopped = Status.STALLED if method == "interior_point" else Status.ITERATION_LIMIT  # a limit is one for columns
     assert np.all(solution.status[open_gap] == stopped)
     assert np.all(solution.status[~open_gap] == Status.SOLVED)
 

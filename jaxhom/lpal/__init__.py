@@ -23,10 +23,16 @@ from jaxhom.lpal.columns import solve_by_columns
 from jaxhom.lpal.flow import solve_by_flow
 from jaxhom.lpal.interior_point import solve_by_interior_point
 from jaxhom.lpal.presolve import reduce_expectations, restore
+from jaxhom.lpal.quickest import solve_by_the_quickest
 from jaxhom.lpal.sensitivity import with_derivatives, without_tangents
 from jaxhom.mdp import MDP, check_policy_shape
 
-_METHODS = {"columns": solve_by_columns, "flow": solve_by_flow, "interior_point": solve_by_interior_point}
+_METHODS = {
+    "auto": solve_by_the_quickest,
+    "columns": solve_by_columns,
+    "flow": solve_by_flow,
+    "interior_point": solve_by_interior_point,
+}
 
 __all__ = ["LPALSolution", "lpal"]
 
@@ -38,7 +44,7 @@ def lpal(
     initial_policy: jax.Array | None = None,
     warm_start: LPALSolution | None = None,
     tolerance: float | None = None,
-    method: str = "columns",
+    method: str = "auto",
     max_iterations: int | None = None,
     progress: bool = False,
 ) -> LPALSolution:
@@ -53,10 +59,10 @@ def lpal(
         expectations: its weights and, unless `initial_policy` is given, its policy are where to begin.
       tolerance: largest certified gap margin_bound - margin to settle for; by default
         1e-5 / (1 - discount) times the largest |feature|.
-      method: "columns"; "interior_point", far faster where features are many and do not overlap, on models whose graph
-        is a narrow band (grids), one lane at a time; or "flow" for PDHG on the linear program with exact projections
-        on the flow, all lanes at once: an independent second opinion, slower, for models whose graph is a narrow band
-        or that have up to a few thousand states.
+      method: "columns"; "interior_point", one lane at a time, for models whose graph is a narrow band (grids) and many
+        features that do not overlap; "auto" for the quicker of these two, columns wherever a guess or a limit is given;
+        or "flow" for PDHG on the linear program with exact projections on the flow, all lanes at once: an independent
+        second opinion, slower, for models whose graph is a narrow band or that have up to a few thousand states.
       max_iterations: columns (default 500), interior-point steps (100) or PDHG iterations (20,000; one to seven
         thousand are usual) after which to stop; `status` tells.
       progress: show a progress bar of the largest gap.
@@ -93,7 +99,7 @@ def lpal(
         _require_solution(warm_start)
         if initial_policy is None:
             initial_policy = warm_start.policy
-        if method == "columns":
+        if method in ("auto", "columns"):
             options["initial_weights"] = _guess("warm_start.weights", warm_start.weights, batch)
     if initial_policy is not None:
         initial_policy = checks.as_host_array("initial_policy", initial_policy)

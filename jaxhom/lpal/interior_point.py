@@ -18,6 +18,9 @@ from jaxhom.pdhg import Status
 from jaxhom.sparse_interior_point import Rows, flow_matrix, solve
 
 _MARGIN_SHARE = 0.1  # of the tolerance, for z . s and the residuals
+_QUICK_STEP = 3e7  # multiplications of a factorisation
+_QUICK_STATES = 1024
+_MANY_FEATURES = 16
 
 
 def solve_by_interior_point(
@@ -32,10 +35,7 @@ def solve_by_interior_point(
     """`lpal` on a batch: expectations [B, K]. An interior method starts in the middle: `initial_policy` is not used."""
     del initial_policy
     pairs, num_features = mdp.num_states * mdp.num_actions, mdp.num_features
-    features = scipy.sparse.csr_array(np.asarray(mdp.features, float).reshape(pairs, num_features).T)
-    matrix = scipy.sparse.block_array([[flow_matrix(mdp), None], [features, -scipy.sparse.eye_array(num_features)]])
-    free_column = np.concatenate([np.zeros(mdp.num_states), -np.ones(num_features)])[:, None]
-    rows = Rows(matrix, free_column, mdp.num_states)
+    rows = _rows(mdp)
     cost, initial = np.zeros(pairs + num_features), np.asarray(mdp.initial, float)
     points = []
     for expected in tqdm(np.asarray(expectations, float), desc="LPAL", unit="lane", disable=not progress):
@@ -51,3 +51,22 @@ def solve_by_interior_point(
     steps = np.array([point.iterations for point in points])
     x = jnp.asarray(x, mdp.dtype)
     return certify(mdp, expectations, x, bound, tolerance, steps, stopped=Status.STALLED)
+
+
+def is_quick(mdp: MDP) -> bool:
+    """Whether a lane takes some tens of milliseconds: a narrow band, and many features that do not overlap."""
+    if mdp.is_dense or mdp.dtype != jnp.float64 or mdp.num_states > _QUICK_STATES or mdp.num_features < _MANY_FEATURES:
+        return False
+    if np.count_nonzero(np.asarray(mdp.features), axis=-1).max() > 1:
+        return False
+    rows = _rows(mdp)
+    return rows.num_core * rows.bandwidth**2 <= _QUICK_STEP
+
+
+def _rows(mdp: MDP) -> Rows:
+    """The rows of the program: the flow, then one per feature."""
+    pairs, num_features = mdp.num_states * mdp.num_actions, mdp.num_features
+    features = scipy.sparse.csr_array(np.asarray(mdp.features, float).reshape(pairs, num_features).T)
+    matrix = scipy.sparse.block_array([[flow_matrix(mdp), None], [features, -scipy.sparse.eye_array(num_features)]])
+    free_column = np.concatenate([np.zeros(mdp.num_states), -np.ones(num_features)])[:, None]
+    return Rows(matrix, free_column, mdp.num_states)

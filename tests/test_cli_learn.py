@@ -131,7 +131,10 @@ def test_lpal_is_certified(files, options):
     np.testing.assert_allclose(found["margin"], margin, atol=1e-9)
 
 
-@pytest.mark.parametrize(("options", "solver"), [("", "columns"), ("--lpal", "columns"), ("--lpal flow", "flow")])
+@pytest.mark.parametrize(
+    ("options", "solver"),
+    [("", "auto"), ("--lpal", "auto"), ("--lpal columns", "columns"), ("--lpal flow", "flow")],
+)
 def test_the_solver_and_its_tolerance_reach_lpal(files, monkeypatch, options, solver):
     given = {}
 

@@ -36,7 +36,7 @@ demonstrations in .csv files: one step a line, the first line names the columns 
 .npz files are NumPy archives (numpy.savez) of plain arrays:
 
 {}"""
-_LPAL_METHODS = ("columns", "interior_point", "flow")
+_LPAL_METHODS = ("auto", "columns", "interior_point", "flow")
 
 
 def add_parser(commands) -> None:
@@ -56,7 +56,7 @@ def add_parser(commands) -> None:
         const=_LPAL_METHODS[0],
         choices=_LPAL_METHODS,
         metavar="SOLVER",
-        help="feed the policy's feature expectations to LPAL; solved by columns (default), interior_point or flow",
+        help="feed the policy's feature expectations to LPAL; solved by columns, interior_point, flow, or auto (default) for the quicker of the first two",
     )
     group.add_argument(
         "--lpal-tolerance", type=float, metavar="T", help="largest certified gap of the margin to settle for"

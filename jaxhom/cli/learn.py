@@ -56,7 +56,8 @@ def add_parser(commands) -> None:
         const=_LPAL_METHODS[0],
         choices=_LPAL_METHODS,
         metavar="SOLVER",
-        help="feed the policy's feature expectations to LPAL; solved by columns, interior_point, flow, or auto (default) for the quicker of the first two",
+        help="feed the policy's feature expectations to LPAL; solved by columns, interior_point, flow, or by the "
+        "quicker of the first two: auto (default)",
     )
     group.add_argument(
         "--lpal-tolerance", type=float, metavar="T", help="largest certified gap of the margin to settle for"

@@ -8,9 +8,9 @@ Given expectations Vhat of the expert's features, find the policy with the large
 margin v is worth at least the expert's value plus v times the sum of the weights.
 
 `columns` plays the game over policies, `flow` runs PDHG on the linear program itself (`flow_factor` prepares its
-projection on the flow), `interior_point` a sparse interior-point method on the same; all end in `certificate`, which
-computes the true margin of the policy that is returned and the best upper bound. `presolve` takes out what no policy
-can reach, `sensitivity` gives the margin its derivatives.
+projection on the flow), `interior_point` a sparse interior-point method on the same, and `quickest` chooses; all end in
+`certificate`, which computes the true margin of the policy that is returned and the best upper bound. `presolve` takes
+out what no policy can reach, `sensitivity` gives the margin its derivatives.
 """
 
 import jax

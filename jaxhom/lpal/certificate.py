@@ -1,4 +1,4 @@
-"""What both LPAL methods return, and the two sides of its certificate.
+"""What all LPAL methods return, and the two sides of its certificate.
 
 Any policy bounds v* from below by its margin min_i V_i(pi) - Vhat_i, one linear solve. Any w in the simplex bounds it
 from above by max_pi w . V(pi) - w . Vhat, one planning problem. Neither relies on how pi or w were found.
@@ -26,7 +26,7 @@ class LPALSolution:
       margin: scalar, min_i V_i(policy) - expectations_i, the true margin of the returned policy.
       margin_bound: scalar, no policy's margin is larger.
       weights: [K], the reward weights that prove `margin_bound`: non-negative, sum 1.
-      iterations: int32 scalar, columns or PDHG iterations.
+      iterations: int32 scalar: columns, interior-point steps or PDHG iterations.
       status: int32 scalar, a `jaxhom.Status`.
     """
 

@@ -26,6 +26,7 @@ from jaxhom.policy_chain import policy_chain
 _MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
 _MAX_LU_STATES_DENSE = 256  # ... and products with the dense tensor
 _MAX_KRYLOV_STEPS = 1000
+_CACHED_NUMBERS = 3000  # states times lanes of a batch
 
 
 def occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
@@ -129,8 +130,12 @@ def _solve_flow(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
     """Solves (I - gamma P_pi)^T mu = source; [S] or, batch last, [S, B]."""
     if is_solved_by_lu(mdp):
         return _solve_by_lu(mdp, policy, source, transpose=True)
-    forward, backward = _products(mdp, policy)
-    return _solve_implicitly(mdp.discount, forward, backward, source)
+
+    def solve(policy, source):
+        forward, backward = _products(mdp, policy)
+        return _solve_implicitly(mdp.discount, forward, backward, source)
+
+    return _some_lanes_at_a_time(solve, policy, source)
 
 
 @jax.jit
@@ -138,8 +143,33 @@ def _solve_values(mdp: MDP, policy: jax.Array, source: jax.Array) -> jax.Array:
     """Solves (I - gamma P_pi) V = source; [S] or, batch last, [S, B]."""
     if is_solved_by_lu(mdp):
         return _solve_by_lu(mdp, policy, source, transpose=False)
-    forward, backward = _products(mdp, policy)
-    return _solve_implicitly(mdp.discount, backward, forward, source)
+
+    def solve(policy, source):
+        forward, backward = _products(mdp, policy)
+        return _solve_implicitly(mdp.discount, backward, forward, source)
+
+    return _some_lanes_at_a_time(solve, policy, source)
+
+
+def _some_lanes_at_a_time(solve: Callable, policy: jax.Array, source: jax.Array) -> jax.Array:
+    """`solve(policy, source)`, for policies [S, A, B] in batches that a CPU's cache can hold.
+
+    Every lane brings weights on all edges, so that products of wide batches would wait for memory.
+    """
+    num_states, lanes = len(source), policy.shape[2] if policy.ndim == 3 else 1
+    width = max(1, _CACHED_NUMBERS // num_states)
+    if lanes <= width or jax.default_backend() != "cpu":
+        return solve(policy, source)
+    batches = -(-lanes // width)
+    width = -(-lanes // batches)
+
+    def split(array):
+        padding = [(0, 0)] * (array.ndim - 1) + [(0, batches * width - lanes)]
+        padded = jnp.pad(array, padding, mode="edge")
+        return jnp.moveaxis(padded.reshape(*array.shape[:-1], batches, width), -2, 0)
+
+    solved = jax.lax.map(lambda batch: solve(*batch), (split(policy), split(source)))
+    return jnp.moveaxis(solved, 0, 1).reshape(num_states, -1)[:, :lanes]
 
 
 def is_solved_by_lu(mdp: MDP) -> bool:

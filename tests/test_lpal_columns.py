@@ -71,9 +71,12 @@ def test_one_hot():
 WIDTH = 5
 
 
-@pytest.mark.parametrize(("features", "capacity"), [(1, 32), (16, 32), (17, 64), (32, 64), (33, 128), (100, 256)])
-def test_capacities(features, capacity):
-    assert column_games.largest_capacity(features) == capacity
+@pytest.mark.parametrize(
+    ("features", "expected"),
+    [(1, [32]), (8, [32]), (9, [32, 64]), (16, [32, 64]), (17, [32, 64, 128]), (64, [32, 128, 256])],
+)
+def test_capacities(features, expected):
+    assert column_games.capacities(features) == expected
 
 
 def payoffs(counts, num_features=20):

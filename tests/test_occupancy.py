@@ -53,7 +53,7 @@ def assert_close_by_scale(actual, expected, tolerance):
 
 
 def test_models_reach_both_solvers():
-    small = [occupancy_module._is_small(small_models.case(name).mdp) for name in SOLVERS]
+    small = [occupancy_module.is_solved_by_lu(small_models.case(name).mdp) for name in SOLVERS]
     assert small == [True, True, False, False]
 
 
@@ -366,3 +366,23 @@ def test_rewards_of_another_shape_are_refused(policy_shape, reward_shape):
     mdp = small_models.case("dense").mdp
     with pytest.raises(ValueError, match=r"reward must have shape \(7, 3\) or the policy's, got"):
         policy_value(mdp, np.ones(policy_shape) / 3, np.ones(reward_shape))
+
+
+def test_wide_batches_are_solved_some_lanes_at_a_time(monkeypatch, rng):
+    """Two lanes at a time, the last of five beside a copy of itself."""
+    case = small_models.case("restart")
+    monkeypatch.setattr(occupancy_module, "_CACHED_NUMBERS", 2 * case.shape[0])
+    policies, rewards = small_models.random_policy(rng, 5, *case.shape), rng.normal(size=(5, *case.shape))
+    for solve in (occupancy_module._occupancy, occupancy_module._solve_values):
+        solve.clear_cache()
+    measures, values = occupancy(case.mdp, policies), policy_value(case.mdp, policies, rewards)
+    gradient = jax.grad(lambda policies: (occupancy(case.mdp, policies) * rewards).sum())(policies)
+    for i, policy in enumerate(policies):
+        expected = oracles.occupancy(case.transition, case.discount, case.initial, policy)
+        np.testing.assert_allclose(measures[i], expected, rtol=0, atol=1e-10)
+        expected = oracles.policy_value(case.transition, case.discount, policy, rewards[i])
+        np.testing.assert_allclose(values[i], expected, rtol=0, atol=1e-10)
+        alone = jax.grad(lambda policy, i=i: (occupancy(case.mdp, policy) * rewards[i]).sum())(policy)
+        np.testing.assert_allclose(gradient[i], alone, rtol=0, atol=1e-8)
+    for solve in (occupancy_module._occupancy, occupancy_module._solve_values):
+        solve.clear_cache()

@@ -8,7 +8,6 @@ A peer tries each of its `bench.lpal_peers.CANDIDATES` and keeps the fastest. If
 larger than what was asked, its tolerance is made ten times smaller, until the gap closes or the time is over.
 """
 
-import argparse
 import dataclasses
 import statistics
 import time
@@ -25,7 +24,7 @@ from bench import limits, lpal_peers  # noqa: E402
 from bench.lpal_certificate import certified_gap  # noqa: E402
 from bench.lpal_instances import INSTANCES  # noqa: E402
 from bench.lpal_program import Model  # noqa: E402
-from bench.speed_rows import commit, matches, print_row, versions  # noqa: E402
+from bench.speed_rows import commit, matches, print_section, versions  # noqa: E402
 
 OURS = {"jaxhom": None, "jaxhom interior_point": "interior_point", "jaxhom flow": "flow"}
 SEED = 0
@@ -219,17 +218,5 @@ def section(name: str, quick: bool, methods: list[str] | None, limit: float | No
             yield from (our_rows if method in OURS else peer_rows)(problem, method)
 
 
-def main() -> None:
-    """Prints the rows of one section as JSON lines."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("section", choices=sorted(INSTANCES))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--methods", nargs="+")
-    parser.add_argument("--limit", type=float)
-    arguments = parser.parse_args()
-    for row in section(arguments.section, arguments.quick, arguments.methods, arguments.limit):
-        print_row(row)
-
-
 if __name__ == "__main__":
-    main()
+    print_section(section, INSTANCES)

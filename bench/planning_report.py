@@ -2,7 +2,7 @@
 
 import pathlib
 
-from bench.speed_rows import COLOURS, MARKERS, Kind, number
+from bench.speed_rows import COLOURS, MARKERS, Kind, is_batch, is_ours, is_settled, number
 
 SECTIONS = (
     *("grid16", "grid32", "grid48", "grid100", "grid316"),
@@ -19,21 +19,6 @@ FIELDS = (
     *("seconds", "compile_s", "build_s", "error_asked", "error", "settled", "iterations"),
     *("status", "note", "versions", "commit"),
 )
-
-
-def is_ours(row: dict) -> bool:
-    """Whether a row is of this library."""
-    return row["method"].startswith("jaxhom")
-
-
-def is_batch(row: dict) -> bool:
-    """Whether a row is of several rewards or policies."""
-    return (number(row, "lanes") or 1) > 1
-
-
-def is_settled(row: dict) -> bool:
-    """Whether a row has a time, and its worst lane the accuracy that was asked for."""
-    return row["status"] == "measured" and number(row, "settled") == 1.0
 
 
 def best_peers(rows: list[dict]) -> dict[tuple[str, str, bool], float]:

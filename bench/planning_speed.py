@@ -9,7 +9,6 @@ the largest reward of an upper bound on the optimal one at every state. Occupanc
 error of 1e-8 against that solve.
 """
 
-import argparse
 import dataclasses
 import statistics
 import time
@@ -26,7 +25,7 @@ from bench import limits, planning_peers  # noqa: E402
 from bench.lpal_certificate import policy_solve  # noqa: E402
 from bench.lpal_program import Model  # noqa: E402
 from bench.planning_instances import TITLES, build, rewards  # noqa: E402
-from bench.speed_rows import commit, matches, print_row, versions  # noqa: E402
+from bench.speed_rows import commit, matches, print_section, versions  # noqa: E402
 
 OURS = "jaxhom"
 SEED = 0
@@ -208,17 +207,5 @@ def section(name: str, quick: bool, methods: list[str] | None, limit: float | No
                 yield from peer_rows(problem, work, method)
 
 
-def main() -> None:
-    """Prints the rows of one section as JSON lines."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("section", choices=sorted(TITLES))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--methods", nargs="+")
-    parser.add_argument("--limit", type=float)
-    arguments = parser.parse_args()
-    for row in section(arguments.section, arguments.quick, arguments.methods, arguments.limit):
-        print_row(row)
-
-
 if __name__ == "__main__":
-    main()
+    print_section(section, TITLES)

@@ -2,7 +2,7 @@
 
 import pathlib
 
-from bench.speed_rows import COLOURS, MARKERS, Kind, number
+from bench.speed_rows import COLOURS, MARKERS, Kind, is_ours, number
 
 FIELDS = (
     *("section", "work", "n", "m", "actions", "pairs", "method", "dtype", "device", "devices", "processes"),
@@ -17,10 +17,6 @@ QUICK = ("brackets", "decisions", "gradients", "peers")
 _MIN_SETTLED = 0.98
 
 
-def _is_ours(row: dict) -> bool:
-    return row["method"].startswith("jaxhom")
-
-
 def best_peers(rows: list[dict]) -> dict[tuple[str, str], float]:
     """Least time per pair among the peers that certify nearly every pair, by work and n.
 
@@ -28,7 +24,7 @@ def best_peers(rows: list[dict]) -> dict[tuple[str, str], float]:
     """
     best: dict[tuple[str, str], float] = {}
     for row in rows:
-        if _is_ours(row) or row["status"] != "measured" or (number(row, "settled") or 0.0) < _MIN_SETTLED:
+        if is_ours(row) or row["status"] != "measured" or (number(row, "settled") or 0.0) < _MIN_SETTLED:
             continue
         works = ("brackets", "decisions") if row["work"] == "brackets" else (row["work"],)
         for work in works:
@@ -58,7 +54,7 @@ def table(rows: list[dict]) -> str:
 
 def _table_line(row: dict, best: dict) -> str:
     time, peer = number(row, "ms_per_pair"), best.get((row["work"], row["n"]))
-    ratio = f"{peer / time:.1f} times" if time and peer and _is_ours(row) else ""
+    ratio = f"{peer / time:.1f} times" if time and peer and is_ours(row) else ""
     method = row["method"] + (f" ({row['status']})" if row["status"] != "measured" else "")
     cells = [row["n"], row["m"], row["pairs"], method, row["dtype"], row["devices"], row["processes"]]
     for name, style in (("gap_certified", ".1e"), ("settled", ".3f"), ("compile_s", ".1f"), ("seconds", ".3g")):

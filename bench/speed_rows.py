@@ -1,5 +1,6 @@
 """Rows of the benchmarks of speed: measured section by section, kept as CSV. Never imports JAX."""
 
+import argparse
 import csv
 import dataclasses
 import functools
@@ -7,7 +8,7 @@ import json
 import pathlib
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from importlib import metadata
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
@@ -83,6 +84,33 @@ def matches(method: str, wanted: list[str] | None) -> bool:
 def number(row: dict, name: str) -> float | None:
     """A field as a number, None where it is empty."""
     return float(row[name]) if row.get(name) not in (None, "") else None
+
+
+def is_ours(row: dict) -> bool:
+    """Whether a row is of this library."""
+    return row["method"].startswith("jaxhom")
+
+
+def is_batch(row: dict) -> bool:
+    """Whether a row is of lanes that are solved together."""
+    return (number(row, "lanes") or 1) > 1
+
+
+def is_settled(row: dict) -> bool:
+    """Whether a row has a time, and its worst lane the accuracy that was asked for."""
+    return row["status"] == "measured" and number(row, "settled") == 1.0
+
+
+def print_section(section: Callable[..., Iterator[dict]], names: Iterable[str]) -> None:
+    """The command line of a section's process: prints its rows as JSON lines."""
+    parser = argparse.ArgumentParser(description=print_section.__doc__)
+    parser.add_argument("section", choices=sorted(names))
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--methods", nargs="+")
+    parser.add_argument("--limit", type=float)
+    arguments = parser.parse_args()
+    for row in section(arguments.section, arguments.quick, arguments.methods, arguments.limit):
+        print_row(row)
 
 
 def print_row(row: dict) -> None:

@@ -96,6 +96,11 @@ def _num_workers(devices: Sequence[jax.Device]) -> int:
     """Batches under way at a time: as many as there are cores, on a CPU that is one device."""
     if len(devices) > 1 or devices[0].platform != "cpu":
         return 1
+    return num_cores()
+
+
+def num_cores() -> int:
+    """Programs to have under way at a time on a CPU: one per core, because XLA runs small ones on one core each."""
     return min(_MAX_WORKERS, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 

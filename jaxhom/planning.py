@@ -125,7 +125,7 @@ def _reward_batch(mdp: MDP, reward: jax.Array) -> tuple[jax.Array, bool]:
 
 @functools.partial(jax.jit, static_argnames="max_iterations")
 def _plan(mdp, reward, value, tolerance, *, max_iterations) -> Plan:
-    """Batch-last value iteration: reward [S, A, B], value [S, B], tolerance [B]."""
+    """Batch-last modified policy iteration: reward [S, A, B], value [S, B], tolerance [B]."""
     lane = 0 if reward.shape[-1] == 1 else slice(None)  # gathers of single numbers, not of rows of one
     value, iterations = _iterate(mdp, reward[..., lane], value[..., lane], tolerance[lane], max_iterations)
     value = value.reshape(len(reward), -1)
@@ -197,7 +197,8 @@ def _sweeps(mdp: MDP, reward: jax.Array) -> tuple[Callable, ...]:
 
     A policy is what its sweep adds up: rewards [S], and weights [U, S] on the edges of the graph. In batches, where
     every lane would have weights of its own, memory is the limit: the sweep over all actions, whose weights all lanes
-    share, is as fast, and does better. So it is where actions lead to different states.
+    share, is as fast, and does better. So it is where actions lead to different states,
+    and where some states have many more successors than most.
     """
     rewards = jax.lax.optimization_barrier(jnp.moveaxis(reward, 1, 0))  # each action's in one piece
     if mdp.is_dense or not saves_gathers(mdp.edges, mdp.narrow_width):

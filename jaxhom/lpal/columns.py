@@ -16,7 +16,6 @@ in step, so that the answer does not depend on which thread is first.
 """
 
 import dataclasses
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -25,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jaxhom.lane_queue import num_cores
 from jaxhom.lpal.certificate import LPALSolution, UpperBound, certify
 from jaxhom.lpal.column_games import capacities, play
 from jaxhom.lpal.policy_pool import PolicyPool
@@ -62,7 +62,7 @@ def solve_by_columns(
     total = len(expectations)
     on_cpu = jax.default_backend() == "cpu"
     # Two programs that both call LAPACK can wait for each other for ever (see `jaxhom.inverse_factor`).
-    workers = _num_cores() if on_cpu and not is_solved_by_lu(mdp) else 1
+    workers = num_cores() if on_cpu and not is_solved_by_lu(mdp) else 1
     width = _NUMBERS_AT_A_TIME // mdp.num_states if on_cpu else _MAX_WIDTH
     width = min(max(1, width), _MAX_WIDTH, -(-total // workers))
     host = tuple(None if array is None else np.asarray(array) for array in (initial_policy, initial_weights))
@@ -79,11 +79,6 @@ def solve_by_columns(
             bar.update(len(busy))
             busy = [lane for lane in busy if not lane.is_done(tolerance, max_iterations)]
         return solver.certify(mdp, lanes, max_iterations)
-
-
-def _num_cores() -> int:
-    """Programs under way at a time: one per core, because XLA runs small ones on one core each."""
-    return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 @dataclasses.dataclass(eq=False)
@@ -171,6 +166,8 @@ class _Solver:
         per_lane = max(1, min(len(self.pulls), self.workers // len(lanes)))
         is_first = lanes[0].row_probabilities is None
         asked = [(lane, pull) for pull in self.pulls[: 1 if is_first else per_lane] for lane in lanes]
+        for lane in lanes:
+            lane.idle += 1
         chunks = self._chunks(asked)
         for chunk, answers in zip(chunks, self.run(self._respond, chunks), strict=True):
             for k, (lane, _) in enumerate(chunk):
@@ -196,7 +193,6 @@ class _Solver:
         lane.add([number], self.room)
         lane.value = answer["value"]
         lane.made += 1
-        lane.idle += 1
         if answer["margin_bound"] < lane.bound:
             lane.bound, lane.weights, lane.actions = answer["margin_bound"], answer["weights"], answer["actions"]
             lane.idle = 0

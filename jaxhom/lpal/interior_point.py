@@ -31,11 +31,15 @@ def solve_by_interior_point(
     *,
     max_iterations: int = 100,
     progress: bool = False,
+    rows: Rows | None = None,
 ) -> LPALSolution:
-    """`lpal` on a batch: expectations [B, K]. An interior method starts in the middle: `initial_policy` is not used."""
+    """`lpal` on a batch: expectations [B, K]. An interior method starts in the middle: `initial_policy` is not used.
+
+    `rows` are those of `quick_rows`, where they are there.
+    """
     del initial_policy
     pairs, num_features = mdp.num_states * mdp.num_actions, mdp.num_features
-    rows = _rows(mdp)
+    rows = rows or _rows(mdp)
     cost, initial = np.zeros(pairs + num_features), np.asarray(mdp.initial, float)
     points = []
     for expected in tqdm(np.asarray(expectations, float), desc="LPAL", unit="lane", disable=not progress):
@@ -53,14 +57,14 @@ def solve_by_interior_point(
     return certify(mdp, expectations, x, bound, tolerance, steps, stopped=Status.STALLED)
 
 
-def is_quick(mdp: MDP) -> bool:
-    """Whether a lane takes some tens of milliseconds: a narrow band, and many features that do not overlap."""
+def quick_rows(mdp: MDP) -> Rows | None:
+    """The rows of the program if a lane takes some tens of milliseconds: a narrow band, and many features apart."""
     if mdp.is_dense or mdp.dtype != jnp.float64 or mdp.num_states > _QUICK_STATES or mdp.num_features < _MANY_FEATURES:
-        return False
+        return None
     if np.count_nonzero(np.asarray(mdp.features), axis=-1).max() > 1:
-        return False
+        return None
     rows = _rows(mdp)
-    return rows.num_core * rows.bandwidth**2 <= _QUICK_STEP
+    return rows if rows.num_core * rows.bandwidth**2 <= _QUICK_STEP else None
 
 
 def _rows(mdp: MDP) -> Rows:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxhom.lpal.certificate import LPALSolution
 from jaxhom.lpal.columns import solve_by_columns
-from jaxhom.lpal.interior_point import is_quick, solve_by_interior_point
+from jaxhom.lpal.interior_point import quick_rows, solve_by_interior_point
 from jaxhom.mdp import MDP
 from jaxhom.pdhg import Status
 
@@ -29,11 +29,12 @@ def solve_by_the_quickest(
     """`lpal` on a batch: expectations [B, K]. What is given to begin with, and a limit, are for columns."""
     options = {"progress": progress} | ({} if max_iterations is None else {"max_iterations": max_iterations})
     is_guided = any(given is not None for given in (initial_policy, initial_weights, max_iterations))
-    if is_guided or not is_quick(mdp):
+    rows = None if is_guided else quick_rows(mdp)
+    if rows is None:
         return solve_by_columns(
             mdp, expectations, initial_policy, tolerance, initial_weights=initial_weights, **options
         )
-    solution = solve_by_interior_point(mdp, expectations, None, tolerance, progress=progress)
+    solution = solve_by_interior_point(mdp, expectations, None, tolerance, progress=progress, rows=rows)
     left = np.flatnonzero(np.asarray(solution.status) != Status.SOLVED)
     if not left.size:
         return solution

@@ -88,6 +88,7 @@ class Board:
 
 
 def board_of(domain, kind=(Gridworld, Racetrack, TileMap)) -> Board:
+    """The board of a domain; `ValueError` unless the domain is of the given kind or one of the given kinds."""
     if not isinstance(domain, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         names = " or ".join(f"a {kind.__name__}" for kind in kinds)

@@ -23,7 +23,8 @@ from jaxhom.demonstrations import Demonstrations, empirical_policy
 from jaxhom.explainers import ByOccupancy
 from jaxhom.generalization import Generalization
 from jaxhom.mdp import MDP
-from jaxhom.sparse_interior_point import Rows, flow_matrix, solve
+from jaxhom.normal_equations import Rows, flow_matrix
+from jaxhom.sparse_interior_point import solve
 
 _TOLERANCE = 1e-7  # of the objective and of the residuals, as a share of all discounted time
 _GOOD_ENOUGH = 1e-5  # beyond which HiGHS has to do it

@@ -2,27 +2,26 @@
 
     min c . z + g . f   subject to   A z + B f = b,   z >= 0,   f free,
 
-with A sparse and B a few dense columns. Flow constraints link a state to its successors alone, so the normal matrix
-A D A^T of an interior-point step is as sparse as the model's graph: on a grid it is a band about twice as wide as the
-grid. Each step (Mehrotra's predictor and corrector, 1992) costs one banded Cholesky factorisation, after reverse
-Cuthill-McKee ordering. Rows that share no column with one another (one per state, or one per region) have a diagonal
-block in the normal matrix and are eliminated before, which leaves the band as narrow as the flow's own.
+with A sparse and B a few dense columns. Each step costs one factorisation (`jaxhom.normal_equations`) and some solves:
+Mehrotra's predictor and corrector (1992), then correctors after Gondzio (1996), which pull the products z s together
+that would otherwise end far apart: programs over occupancies stall without them.
 
 Certificates are left to the caller, who knows how to make feasible points of z and of the multipliers.
 """
 
+from typing import NamedTuple
+
 import chex
 import numpy as np
-import scipy.linalg
-import scipy.sparse
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxhom.mdp import MDP
+from jaxhom.normal_equations import Rows
 
 _TO_BOUNDARY = 0.995
-_REGULARISATION = 1e-14  # share of each diagonal entry of the normal matrix
-_REFINEMENTS = 2  # per solve: as z / s spreads, the factorisation alone loses digits
 _PATIENCE = 30  # steps without a smaller error, after which rounding has won
+_CORRECTORS = 3  # after Mehrotra's, at most
+_LONGER = 0.3  # what a corrector aims to add to the step
+_SOME = 0.03  # what it has to add to be kept
+_EVEN = 0.1  # products between this share of the target and its inverse are let be
 
 
 @chex.dataclass(frozen=True)
@@ -43,87 +42,6 @@ class InteriorPoint:
     iterations: int = 0
 
 
-def flow_matrix(mdp: MDP) -> scipy.sparse.csr_array:
-    """F [S, S A] of the Bellman flow F x = alpha: (F x)(s) = sum_a x(s, a) - gamma sum_{s', a} x(s', a) T(s', a, s)."""
-    num_states, num_actions, slots = mdp.next_state.shape
-    pair = np.arange(num_states * num_actions)
-    probability = np.asarray(mdp.probability, float).ravel()
-    entries = (probability, (np.asarray(mdp.next_state).ravel(), np.repeat(pair, slots)))
-    inflow = scipy.sparse.csr_array(entries, shape=(num_states, len(pair)))
-    outflow = scipy.sparse.csr_array((np.ones(len(pair)), (pair // num_actions, pair)), shape=inflow.shape)
-    flow = outflow - float(mdp.discount) * inflow
-    flow.eliminate_zeros()
-    return flow
-
-
-class Rows:
-    """A and B of a program, and what its normal matrices share: prepared once, for any number of programs.
-
-    Args:
-      matrix: sparse A [n, m], every row with an entry.
-      free_columns: B [n, q].
-      num_core: rows from this number on are eliminated before the others are factorised. They must not share columns
-        with one another; if they do, all rows are factorised together.
-    """
-
-    def __init__(self, matrix, free_columns: np.ndarray, num_core: int):
-        self.matrix, self.free_columns = scipy.sparse.csr_array(matrix), free_columns
-        self.transpose = self.matrix.T.tocsr()
-        extra = self.matrix[num_core:]
-        shared = (abs(extra) @ abs(extra).T).tocoo()
-        self.num_core = num_core if (shared.row == shared.col).all() else self.matrix.shape[0]
-        self._core, self._extra = self.matrix[: self.num_core], self.matrix[self.num_core :]
-        self._square = self._extra.multiply(self._extra).tocsr()
-        pattern = self._schur(abs(self._core), -abs(self._extra), np.ones(self.matrix.shape[1]))[0]
-        self._order = reverse_cuthill_mckee(pattern.tocsr(), symmetric_mode=True)
-        self._place = np.argsort(self._order)
-        self.bandwidth = int(np.abs(self._place[pattern.row] - self._place[pattern.col]).max())
-
-    def factor(self, d: np.ndarray) -> None:
-        """Factorises A diag(d) A^T bordered by B, for d [m] positive."""
-        self._d = d
-        schur, self._cross, self._diagonal = self._schur(self._core, self._extra, d)
-        row, column = self._place[schur.row], self._place[schur.col]
-        lower = row >= column
-        band = np.zeros((self.bandwidth + 1, self.num_core))
-        band[(row - column)[lower], column[lower]] = schur.data[lower]
-        band[0] *= 1.0 + _REGULARISATION
-        self._factor = scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
-        self._behind_free = self._solve_normal(self.free_columns)
-        self._free_block = self.free_columns.T @ self._behind_free
-
-    def solve(self, right: np.ndarray, free_right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Solves A D A^T y + B f = right, B^T y = free_right, with iterative refinement."""
-        y, f = self._solve_once(right, free_right)
-        for _ in range(_REFINEMENTS):
-            missing = right - self.matrix @ (self._d * (self.transpose @ y)) - self.free_columns @ f
-            more_y, more_f = self._solve_once(missing, free_right - self.free_columns.T @ y)
-            y, f = y + more_y, f + more_f
-        return y, f
-
-    def _solve_once(self, right, free_right):
-        y = self._solve_normal(right)
-        f = np.linalg.solve(self._free_block, self.free_columns.T @ y - free_right)
-        return y - self._behind_free @ f, f
-
-    def _solve_normal(self, right: np.ndarray) -> np.ndarray:
-        """(A D A^T)^-1 right, [n] or [n, q]."""
-        core, extra = right[: self.num_core], right[self.num_core :]
-        diagonal = self._diagonal.reshape(-1, *(1,) * (right.ndim - 1))
-        reduced = core - self._cross @ (extra / diagonal)
-        y = np.empty_like(core)
-        factor = (self._factor, True)
-        y[self._order] = scipy.linalg.cho_solve_banded(factor, reduced[self._order], check_finite=False)
-        return np.concatenate([y, (extra - self._cross.T @ y) / diagonal])
-
-    def _schur(self, core, extra, d):
-        """Normal matrix of the core rows after elimination of the extra ones; the cross block; the extra diagonal."""
-        scaled = core * d
-        cross, diagonal = scaled @ extra.T, self._square @ d
-        schur = scaled @ core.T - (cross / diagonal) @ cross.T
-        return schur.tocoo(), cross, diagonal
-
-
 def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_iterations: int = 100) -> InteriorPoint:
     """Solves one program, or comes as near as rounding allows.
 
@@ -136,7 +54,7 @@ def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_it
     Returns:
       The iterate with the least `error`.
 
-    Source: Mehrotra 1992; Wright 1997, chapter 10.
+    Source: Mehrotra 1992; Gondzio 1996; Wright 1997, chapter 10.
     """
     program = (cost, free_cost, right)
     point = best = _start(rows, *program)
@@ -155,7 +73,12 @@ def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_it
 
 
 def _start(rows: Rows, cost, free_cost, right) -> InteriorPoint:
-    """Mehrotra's start: the least-norm solutions of both sets of equations, pushed into the interior."""
+    """Mehrotra's start: the least-norm solutions of both sets of equations, pushed into the interior.
+
+    Then s is raised until the products z s are even and weigh as much as the residuals. Where s = 0 is nearly feasible
+    (features that sum to a constant, say), the products would otherwise be nothing long before z is feasible, and the
+    steps no longer than the gap between them.
+    """
     rows.factor(np.ones(len(cost)))
     y, f = rows.solve(right, np.zeros_like(free_cost))
     z = rows.transpose @ y
@@ -164,7 +87,9 @@ def _start(rows: Rows, cost, free_cost, right) -> InteriorPoint:
     z, s = (v + max(-1.5 * v.min(), 0.0) + 1e-8 for v in (z, s))
     product = 0.5 * (z @ s)
     z, s = z + product / s.sum(), s + product / z.sum()
-    return InteriorPoint(z=z, f=f, y=y, s=s)
+    point = InteriorPoint(z=z, f=f, y=y, s=s)
+    worth = sum(_effects(_residuals(rows, cost, free_cost, right, point), point))
+    return point.replace(s=np.maximum(s, worth / (len(z) * z)))
 
 
 def _residuals(rows: Rows, cost, free_cost, right, point: InteriorPoint):
@@ -173,31 +98,65 @@ def _residuals(rows: Rows, cost, free_cost, right, point: InteriorPoint):
 
 
 def _error(residuals, point: InteriorPoint) -> float:
+    return float(max(point.z @ point.s, *_effects(residuals, point)))
+
+
+def _effects(residuals, point: InteriorPoint) -> list[float]:
     """A residual counts with the multiplier, or the variable, that it stands beside: its first-order effect."""
-    effects = zip(residuals, (point.y, point.z, point.f), strict=True)
-    return float(max(point.z @ point.s, *(np.abs(residual) @ np.abs(beside) for residual, beside in effects)))
+    pairs = zip(residuals, (point.y, point.z, point.f), strict=True)
+    return [np.abs(residual) @ np.abs(beside) for residual, beside in pairs]
 
 
 def _step(rows: Rows, residuals, point: InteriorPoint) -> InteriorPoint:
-    """One predictor and corrector step."""
+    """A predictor, a corrector, and further correctors as long as they lengthen the step."""
     z, s = point.z, point.s
-    primal, dual, free = residuals
     rows.factor(z / s)
+    nothing = [np.zeros_like(residual) for residual in residuals]
 
-    def direction(complementarity):
-        y, f = rows.solve(primal - rows.matrix @ ((complementarity - z * dual) / s), free)
-        change = dual - rows.transpose @ y
-        return (complementarity - z * change) / s, change, y, f
+    def direction(products, residuals) -> _Change:
+        """What adds `products` to z s and takes the residuals away, to first order."""
+        primal, dual, free = residuals
+        dy, df = rows.solve(primal - rows.matrix @ ((products - z * dual) / s), free)
+        ds = dual - rows.transpose @ dy
+        return _Change((products - z * ds) / s, df, dy, ds)
 
-    dz, ds, _, _ = direction(-z * s)
-    target = (z + _length(z, dz) * dz) @ (s + _length(s, ds) * ds)
-    centring = (target / (z @ s)) ** 3 * (z @ s) / len(z)
-    dz, ds, dy, df = direction(centring - z * s - dz * ds)
-    along, across = _length(z, dz, _TO_BOUNDARY), _length(s, ds, _TO_BOUNDARY)
-    return point.replace(z=z + along * dz, f=point.f + along * df, s=s + across * ds, y=point.y + across * dy)
+    change = direction(-z * s, residuals)
+    along, across = change.lengths(point)
+    mean = (z @ s) / len(z)
+    target = mean * ((z + along * change.z) @ (s + across * change.s) / (z @ s)) ** 3
+    change = direction(target - z * s - change.z * change.s, residuals)
+    along, across = change.lengths(point)
+    for _ in range(_CORRECTORS):
+        further_along, further_across = min(1.0, along + _LONGER), min(1.0, across + _LONGER)
+        products = (z + further_along * change.z) * (s + further_across * change.s)
+        wanted = np.clip(products, _EVEN * target, target / _EVEN) - products
+        corrected = change.corrected(direction(np.maximum(wanted, -target / _EVEN), nothing))
+        longer_along, longer_across = corrected.lengths(point)
+        if longer_along + longer_across < along + across + _SOME:
+            break
+        change, along, across = corrected, longer_along, longer_across
+    along, across = change.lengths(point, _TO_BOUNDARY)
+    return point.replace(
+        z=z + along * change.z, f=point.f + along * change.f, y=point.y + across * change.y, s=s + across * change.s
+    )
 
 
-def _length(value: np.ndarray, change: np.ndarray, share: float = 1.0) -> float:
-    """The longest step up to 1 that leaves `value` positive, times `share` where the boundary is in the way."""
+class _Change(NamedTuple):
+    """What a step adds to an iterate, before it is cut to length."""
+
+    z: np.ndarray
+    f: np.ndarray
+    y: np.ndarray
+    s: np.ndarray
+
+    def corrected(self, by: "_Change") -> "_Change":
+        return _Change(*map(np.add, self, by))
+
+    def lengths(self, point: InteriorPoint, share: float = 1.0) -> tuple[float, float]:
+        """The longest steps up to 1 that leave z, and s, positive; times `share` where the boundary is in the way."""
+        return _length(point.z, self.z, share), _length(point.s, self.s, share)
+
+
+def _length(value: np.ndarray, change: np.ndarray, share: float) -> float:
     falling = change < 0
     return min(1.0, share * float(np.min(-value[falling] / change[falling], initial=np.inf)))

@@ -15,6 +15,7 @@ import small_models
 from jaxhom import MDP, Status, gridworld, lpal
 from jaxhom.lpal.certificate import policy_from_occupancy
 
+interior_point = importlib.import_module("jaxhom.lpal.interior_point")
 quickest = importlib.import_module("jaxhom.lpal.quickest")
 METHODS = ["columns", "flow", "interior_point", "auto"]
 
@@ -125,19 +126,31 @@ def test_a_gridworld(name, method):
     assert_solved(solution, here.arrays, expectations, tolerance)
 
 
-@pytest.mark.parametrize("cut_short", [False, True])
-def test_columns_go_on_where_the_interior_point_stops(cut_short, monkeypatch):
-    """Sixteen regions of a grid are what the interior point is quick on."""
-    here, names = grid(8), ["perturbed", "of both signs"]
-    if cut_short:
-        stop = functools.partial(quickest.solve_by_interior_point, max_iterations=2)
-        monkeypatch.setattr(quickest, "solve_by_interior_point", stop)
-    expectations = np.stack([here.expectations[name] for name in names])
-    solution = lpal(here.mdp, expectations, tolerance=1e-2)
-    by_interior_point = lpal(here.mdp, expectations, tolerance=1e-2, method="interior_point")
-    assert np.array_equal(solution.iterations, by_interior_point.iterations) != cut_short
-    for i, name in enumerate(names):
-        assert_solved(lane(solution, i), here.arrays, here.expectations[name], 1e-2)
+@pytest.mark.parametrize("max_steps", [2, 50])
+@pytest.mark.parametrize("is_small", [True, False])
+def test_columns_and_the_interior_point_together(is_small, max_steps, monkeypatch):
+    """Half of what is reached in every region can be exceeded in all of them: few policies do not mix so.
+
+    On a small model the interior point begins, else it has what columns leave. If it is stopped too soon, they go on.
+    """
+    here, asked = grid(16), []
+
+    class Program(interior_point.Program):
+        def solve(self, expectations, tolerance, **options):
+            asked.append(expectations)
+            return super().solve(expectations, tolerance, **options | {"max_iterations": max_steps})
+
+    monkeypatch.setattr(interior_point, "Program", Program)
+    monkeypatch.setattr(quickest, "_SMALL_STATES", 256 if is_small else 255)
+    expectations = np.stack([0.5 * here.expectations["exact"], here.expectations["of both signs"]])
+    solution = lpal(here.mdp, expectations)
+    assert len(asked) == (2 if is_small else 1)
+    np.testing.assert_array_equal(asked[0], expectations[0])
+    for i, expected in enumerate(expectations):
+        assert_solved(lane(solution, i), here.arrays, expected, 1e-3)
+    if max_steps == 50:
+        by_columns = lpal(here.mdp, expectations[0], method="columns")
+        assert solution.iterations[0] < 0.7 * by_columns.iterations
 
 
 @pytest.mark.parametrize("name", ["Monte Carlo", "perturbed", "of both signs"])

@@ -59,8 +59,8 @@ def lpal(
         expectations: its weights and, unless `initial_policy` is given, its policy are where to begin.
       tolerance: largest certified gap margin_bound - margin to settle for; by default
         1e-5 / (1 - discount) times the largest |feature|.
-      method: "columns"; "interior_point", one lane at a time, for models whose graph is a narrow band (grids) and many
-        features that do not overlap; "auto" for the quicker of these two, columns wherever a guess or a limit is given;
+      method: "columns"; "interior_point", one lane at a time, for models whose graph is a narrow band (grids) and any
+        number of features; "auto" for the quicker of these two, or both together;
         or "flow" for PDHG on the linear program with exact projections on the flow, all lanes at once: an independent
         second opinion, slower, for models whose graph is a narrow band or that have up to a few thousand states.
       max_iterations: columns (default 500), interior-point steps (100) or PDHG iterations (20,000; one to seven

@@ -25,7 +25,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom.lane_queue import num_cores
-from jaxhom.lpal.certificate import LPALSolution, UpperBound, certify
+from jaxhom.lpal.certificate import LPALSolution, UpperBound, certify, policy_from_occupancy
 from jaxhom.lpal.column_games import capacities, play
 from jaxhom.lpal.policy_pool import PolicyPool
 from jaxhom.lpal.responses import evaluate, respond, with_compact_features
@@ -40,6 +40,10 @@ _LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to the boun
 _SLACK = 0.02  # share of the tolerance that is left to columns that are not quite exact
 _NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact, and many rare states add up
 _PATIENCE = 40  # rounds without any progress, after which rounding has won
+_ROUNDS, _SOME_ROUNDS = 6, 3  # a lane whose bound has not moved by then is at rest if its gap has not for so many
+_MANY_ROUNDS, _MORE_ROUNDS = 12, 5  # likewise, wherever the bound is
+_LITTLE = 0.9  # a gap that is still larger than this share has not moved
+_NEARLY = 30.0  # tolerances within which columns close the gap by themselves
 _YOUNG = 8  # newest columns, never dropped
 _FROM_POOL = 8  # policies of other lanes that join a game at a time
 _WORTHWHILE = 0.1  # share of the open gap by which they have to be better
@@ -57,8 +61,14 @@ def solve_by_columns(
     initial_weights: jax.Array | None = None,
     max_iterations: int = 500,
     progress: bool = False,
+    helper: Callable[[], Callable | None] | None = None,
 ) -> LPALSolution:
-    """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None, initial_weights [B, K] or None."""
+    """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None, initial_weights [B, K] or None.
+
+    `helper()`, called once a lane is at rest, is None or (solve, n): another method for every n-th of such lanes, that
+    takes expectations [K] and returns `jaxhom.lpal.interior_point.Point`, whose policy becomes a column and whose
+    weights the next query. It runs beside the columns of the other lanes.
+    """
     total = len(expectations)
     on_cpu = jax.default_backend() == "cpu"
     # Two programs that both call LAPACK can wait for each other for ever (see `jaxhom.inverse_factor`).
@@ -66,18 +76,31 @@ def solve_by_columns(
     width = _NUMBERS_AT_A_TIME // mdp.num_states if on_cpu else _MAX_WIDTH
     width = min(max(1, width), _MAX_WIDTH, -(-total // workers))
     host = tuple(None if array is None else np.asarray(array) for array in (initial_policy, initial_weights))
-    with ThreadPoolExecutor(workers) as threads, tqdm(disable=not progress, desc="LPAL", unit="column") as bar:
+    bar = tqdm(disable=not progress, desc="LPAL", unit="column")
+    with ThreadPoolExecutor(workers) as threads, ThreadPoolExecutor(1) as beside, bar:
         solver = _Solver(mdp, tolerance, width, workers, threads.map)
         lanes = [solver.start(number, given, *host) for number, given in enumerate(np.asarray(expectations))]
-        waiting, busy = list(reversed(lanes)), []
-        while waiting or busy:
+        waiting, busy, away, rested = list(reversed(lanes)), [], [], []
+        while waiting or busy or away:
+            if not (waiting or busy):  # all come back at once, so that no thread decides who learns from whom
+                busy, away = [solver.take_back(lane, point.result()) for lane, point in away], []
             while waiting and len(busy) < _LANES_AT_A_TIME * workers * width:
                 busy.append(waiting.pop())
             solver.respond_to(busy)
             solver.play_games(busy)
-            bar.set_postfix(gap=f"{max(lane.gap for lane in busy):.2e}", lanes=len(busy) + len(waiting), refresh=False)
+            num_lanes = len(busy) + len(waiting) + len(away)
+            bar.set_postfix(gap=f"{max(lane.gap for lane in busy):.2e}", lanes=num_lanes, refresh=False)
             bar.update(len(busy))
             busy = [lane for lane in busy if not lane.is_done(tolerance, max_iterations)]
+            for lane in [lane for lane in busy if lane.is_at_rest(tolerance)] if helper else []:
+                lane.has_rested = True
+                rested.append(lane)
+                solve, share = helper() or (None, 0)
+                if solve and (len(rested) - 1) % share == 0:
+                    busy.remove(lane)
+                    away.append((lane, beside.submit(solve, lane.expectations)))
+                    if workers == 1:
+                        away[-1][1].result()
         return solver.certify(mdp, lanes, max_iterations)
 
 
@@ -93,7 +116,9 @@ class _Lane:
       columns: numbers of policies of the pool. row_probabilities, probabilities: w and q of the last game; q is 0
         where a column is new.
       lower, mixture: the best lower bound so far, and the policies and probabilities that prove it.
-      made: policies added by this lane. idle: rounds without progress.
+      guess: [K] or None, the next query instead of a mixture.
+      gaps: after each round. made: policies added by this lane. idle: rounds without progress.
+      has_moved: the bound is better than that of the first query. has_rested: it was at rest once.
     """
 
     expectations: np.ndarray
@@ -106,8 +131,12 @@ class _Lane:
     row_probabilities: np.ndarray | None = None
     lower: float = -np.inf
     mixture: tuple[np.ndarray, np.ndarray] | None = None
+    guess: np.ndarray | None = None
+    gaps: list[float] = dataclasses.field(default_factory=list)
     made: int = 0
     idle: int = 0
+    has_moved: bool = False
+    has_rested: bool = False
 
     @property
     def gap(self) -> float:
@@ -118,8 +147,17 @@ class _Lane:
         """Closed, out of columns, or stuck."""
         return self.gap <= (1.0 - _SLACK) * tolerance or self.made >= max_iterations or self.idle >= _PATIENCE
 
+    def is_at_rest(self, tolerance: float) -> bool:
+        """Whether columns will have to be many: the gap stays open, and the first weights are still the best."""
+        rounds, back = (_MANY_ROUNDS, _MORE_ROUNDS) if self.has_moved else (_ROUNDS, _SOME_ROUNDS)
+        if self.has_rested or len(self.gaps) < rounds:
+            return False
+        return self.gap > max(_NEARLY * tolerance, _LITTLE * self.gaps[-1 - back])
+
     def query(self, pull: float) -> np.ndarray:
         """Weights [K] between those of the best bound and those of the last game."""
+        if self.guess is not None:
+            return self.guess
         if self.row_probabilities is None:
             return self.weights
         return pull * self.weights + (1.0 - pull) * self.row_probabilities
@@ -165,13 +203,22 @@ class _Solver:
         """Best responses of every lane to its query: columns, and bounds."""
         per_lane = max(1, min(len(self.pulls), self.workers // len(lanes)))
         is_first = lanes[0].row_probabilities is None
-        asked = [(lane, pull) for pull in self.pulls[: 1 if is_first else per_lane] for lane in lanes]
+        pulls = self.pulls[: 1 if is_first else per_lane]
+        asked = [(lane, pull) for pull in pulls for lane in lanes if pull == pulls[0] or lane.guess is None]
         for lane in lanes:
             lane.idle += 1
         chunks = self._chunks(asked)
         for chunk, answers in zip(chunks, self.run(self._respond, chunks), strict=True):
             for k, (lane, _) in enumerate(chunk):
                 self._take(lane, {name: array[k] for name, array in answers.items()})
+
+    def take_back(self, lane: _Lane, point) -> _Lane:
+        """The lane, with what another method has found: its policy as a column, its weights as the next query."""
+        policy = policy_from_occupancy(self.mdp, jnp.asarray(point.x), self.pool.one_hot(lane.actions))
+        mu, expected = map(np.asarray, evaluate(self.mdp, policy))
+        lane.add([self.pool.add(mu, np.asarray(policy), expected)], self.room)
+        lane.guess, lane.value, lane.made = point.weights, point.value, lane.made + point.steps
+        return lane
 
     def _chunks(self, items: list) -> list[list]:
         return [items[first : first + self.width] for first in range(0, len(items), self.width)]
@@ -193,7 +240,10 @@ class _Solver:
         lane.add([number], self.room)
         lane.value = answer["value"]
         lane.made += 1
+        lane.guess = None
         if answer["margin_bound"] < lane.bound:
+            gain = lane.bound - answer["margin_bound"]
+            lane.has_moved |= bool(_SLACK * self.tolerance < gain < np.inf)
             lane.bound, lane.weights, lane.actions = answer["margin_bound"], answer["weights"], answer["actions"]
             lane.idle = 0
 
@@ -206,6 +256,8 @@ class _Solver:
         joined = [lane for lane in lanes if self._join_from_pool(lane)]
         if joined:
             self._play(joined)
+        for lane in lanes:
+            lane.gaps.append(lane.gap)
 
     def _join_from_pool(self, lane: _Lane) -> bool:
         """Adds the policies that are worth most at the query; False if none is worth much more than the lane's own."""

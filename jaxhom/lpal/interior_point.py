@@ -3,9 +3,11 @@
     max v   subject to   sum x phi_i - v - slack_i = Vhat_i,   the Bellman flow,   x, slack >= 0.
 
 The multipliers of the K feature rows are the weights of the upper bound. Made for models whose graph is a narrow band
-(grids: a few milliseconds a step at 48 x 48) and for features that do not overlap, such as region indicators, of which
-there may be as many as states: where columns would need about as many policies as features, this takes 5-25 steps.
+(grids: a few milliseconds a step at 48 x 48): where columns would need about as many policies as there are features,
+this takes 5-40 steps.
 """
+
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,13 +16,49 @@ from tqdm import tqdm
 
 from jaxhom.lpal.certificate import LPALSolution, bound_by_planning, certify
 from jaxhom.mdp import MDP
+from jaxhom.normal_equations import Rows, flow_matrix
 from jaxhom.pdhg import Status
-from jaxhom.sparse_interior_point import Rows, flow_matrix, solve
+from jaxhom.sparse_interior_point import solve
 
-_MARGIN_SHARE = 0.1  # of the tolerance, for z . s and the residuals
-_QUICK_STEP = 3e7  # multiplications of a factorisation
-_QUICK_STATES = 1024
-_MANY_FEATURES = 16
+_MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """What the method ends with, nothing of it certified: x [S, A], weights [K], value [S], and the steps it took."""
+
+    x: np.ndarray
+    weights: np.ndarray
+    value: np.ndarray
+    steps: int
+
+
+class Program:
+    """The linear program of a model, for any expectations.
+
+    Attributes:
+      work: multiplications of a step, about.
+    """
+
+    def __init__(self, mdp: MDP):
+        pairs, num_features = mdp.num_states * mdp.num_actions, mdp.num_features
+        features = scipy.sparse.csr_array(np.asarray(mdp.features, float).reshape(pairs, num_features).T)
+        slack = -scipy.sparse.eye_array(num_features)
+        matrix = scipy.sparse.block_array([[flow_matrix(mdp), None], [features, slack]])
+        free_column = np.concatenate([np.zeros(mdp.num_states), -np.ones(num_features)])[:, None]
+        self._rows, self._shape = Rows(matrix, free_column, mdp.num_states), (mdp.num_states, mdp.num_actions)
+        self._cost, self._initial = np.zeros(pairs + num_features), np.asarray(mdp.initial, float)
+        self.work = self._rows.work
+
+    def solve(self, expectations: np.ndarray, tolerance: float, **options) -> Point:
+        """One lane: expectations [K], and options of `sparse_interior_point.solve`."""
+        right = np.concatenate([self._initial, expectations])
+        tolerance *= _MARGIN_SHARE
+        point = solve(self._rows, self._cost, np.array([-1.0]), right, tolerance=tolerance, **options)
+        num_states, num_actions = self._shape
+        multipliers = np.maximum(point.y[num_states:], 0.0)
+        x = point.z[: num_states * num_actions].reshape(self._shape)
+        return Point(x, multipliers / multipliers.sum(), -point.y[:num_states], point.iterations)
 
 
 def solve_by_interior_point(
@@ -31,46 +69,20 @@ def solve_by_interior_point(
     *,
     max_iterations: int = 100,
     progress: bool = False,
-    rows: Rows | None = None,
+    program: Program | None = None,
 ) -> LPALSolution:
     """`lpal` on a batch: expectations [B, K]. An interior method starts in the middle: `initial_policy` is not used.
 
-    `rows` are those of `quick_rows`, where they are there.
+    `program` is that of the model, where it is there.
     """
     del initial_policy
-    pairs, num_features = mdp.num_states * mdp.num_actions, mdp.num_features
-    rows = rows or _rows(mdp)
-    cost, initial = np.zeros(pairs + num_features), np.asarray(mdp.initial, float)
-    points = []
-    for expected in tqdm(np.asarray(expectations, float), desc="LPAL", unit="lane", disable=not progress):
-        right = np.concatenate([initial, expected])
-        options = {"tolerance": _MARGIN_SHARE * tolerance, "max_iterations": max_iterations}
-        points.append(solve(rows, cost, np.array([-1.0]), right, **options))
-    x = np.stack([point.z[:pairs] for point in points]).reshape(-1, mdp.num_states, mdp.num_actions)
-    multipliers = np.stack([np.maximum(point.y[mdp.num_states :], 0.0) for point in points])
-    weights = multipliers / multipliers.sum(axis=1, keepdims=True)
-    value = -np.stack([point.y[: mdp.num_states] for point in points])
-    accuracy = jnp.full(len(points), tolerance, mdp.dtype)
-    bound, _ = bound_by_planning(mdp, expectations, *(jnp.asarray(a, mdp.dtype) for a in (weights, value)), accuracy)
-    steps = np.array([point.iterations for point in points])
-    x = jnp.asarray(x, mdp.dtype)
+    program, lanes = program or Program(mdp), np.asarray(expectations, float)
+    bar = tqdm(lanes, desc="LPAL", unit="lane", disable=not progress)
+    points = [program.solve(expected, tolerance, max_iterations=max_iterations) for expected in bar]
+    weights, value, x = (
+        jnp.asarray(np.stack([getattr(point, name) for point in points]), mdp.dtype)
+        for name in ("weights", "value", "x")
+    )
+    bound, _ = bound_by_planning(mdp, expectations, weights, value, jnp.full(len(points), tolerance, mdp.dtype))
+    steps = np.array([point.steps for point in points])
     return certify(mdp, expectations, x, bound, tolerance, steps, stopped=Status.STALLED)
-
-
-def quick_rows(mdp: MDP) -> Rows | None:
-    """The rows of the program if a lane takes some tens of milliseconds: a narrow band, and many features apart."""
-    if mdp.is_dense or mdp.dtype != jnp.float64 or mdp.num_states > _QUICK_STATES or mdp.num_features < _MANY_FEATURES:
-        return None
-    if np.count_nonzero(np.asarray(mdp.features), axis=-1).max() > 1:
-        return None
-    rows = _rows(mdp)
-    return rows if rows.num_core * rows.bandwidth**2 <= _QUICK_STEP else None
-
-
-def _rows(mdp: MDP) -> Rows:
-    """The rows of the program: the flow, then one per feature."""
-    pairs, num_features = mdp.num_states * mdp.num_actions, mdp.num_features
-    features = scipy.sparse.csr_array(np.asarray(mdp.features, float).reshape(pairs, num_features).T)
-    matrix = scipy.sparse.block_array([[flow_matrix(mdp), None], [features, -scipy.sparse.eye_array(num_features)]])
-    free_column = np.concatenate([np.zeros(mdp.num_states), -np.ones(num_features)])[:, None]
-    return Rows(matrix, free_column, mdp.num_states)

@@ -44,6 +44,7 @@ class MDP:
       features: float [S, A, K]; the unknown reward is sum_i w_i features[..., i] with w_i >= 0.
       discount: float scalar, strictly between 0 and 1.
       wide_pairs: int32 [J], flat (s, a) indices of the pairs with successors beyond the narrow width.
+      wide_successors: int32 [N], the successors of all these pairs, if they are the same (restarts); else None.
       predecessors: per state s', the flat (s, a, slot) entries that lead to it; None in the dense layout.
       edges: the graph's edges, for the chains of policies; None in the dense layout.
       narrow_width: slots that every sweep reads for every pair.
@@ -55,6 +56,7 @@ class MDP:
     features: jax.Array
     discount: jax.Array
     wide_pairs: jax.Array
+    wide_successors: jax.Array | None
     predecessors: PaddedRows | None
     edges: Edges | None
     narrow_width: int = dataclasses.field(metadata={"static": True})
@@ -141,11 +143,14 @@ class MDP:
         discount = checks.require_discount(discount, dtype)
         _require_contraction(probability, discount)
         dense = width == num_states
-        slots, wide_pairs, predecessors, edges = width, np.zeros(0, np.int32), None, None
+        slots, wide_pairs, wide_successors, predecessors, edges = width, np.zeros(0, np.int32), None, None, None
         if not dense:
             counts = (probability > 0).sum(axis=-1).ravel()
             slots = narrow_width(counts)
             wide_pairs = np.flatnonzero(counts > slots).astype(np.int32)
+            lists = next_state.reshape(-1, width)[wide_pairs]
+            if len(lists) and (lists == lists[0]).all():
+                wide_successors = jnp.asarray(lists[0], jnp.int32)
             entry = np.flatnonzero(probability > 0)
             predecessors = pad_rows(entry, next_state.ravel()[entry], num_states, next_state.size)
             edges = find_edges(next_state, probability)
@@ -156,6 +161,7 @@ class MDP:
             features=jnp.asarray(features, dtype),
             discount=jnp.asarray(discount, dtype),
             wide_pairs=jnp.asarray(wide_pairs),
+            wide_successors=wide_successors,
             predecessors=jax.tree.map(jnp.asarray, predecessors),
             edges=jax.tree.map(jnp.asarray, edges),
             narrow_width=slots,
@@ -230,8 +236,11 @@ def expected_next_values(mdp: MDP, value: jax.Array) -> list[jax.Array]:
     index, weight = mdp.next_state[..., :width], mdp.probability[..., :width]
     if mdp.wide_pairs.size:
         # A wide row's expectation is computed beside the states' values and looked up like one more state.
-        rows = mdp.next_state.reshape(-1, slots)[mdp.wide_pairs]
-        expectation = gather_sum(rows, mdp.probability.reshape(-1, slots)[mdp.wide_pairs], value)
+        wide = mdp.probability.reshape(-1, slots)[mdp.wide_pairs]
+        if mdp.wide_successors is None:
+            expectation = gather_sum(mdp.next_state.reshape(-1, slots)[mdp.wide_pairs], wide, value)
+        else:
+            expectation = wide @ value[mdp.wide_successors]
         lookup = mdp.num_states + jnp.arange(mdp.wide_pairs.size, dtype=index.dtype)
         first = jnp.arange(width) == 0
         index = _replace_pairs(index, mdp.wide_pairs, jnp.where(first, lookup[:, None], 0))

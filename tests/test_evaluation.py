@@ -223,6 +223,7 @@ def test_the_dense_layout_is_the_sparse_one(case):
         predecessors=None,
         edges=None,
         narrow_width=S,
+        wide_successors=None,
     )
     assert dense.is_dense
     assert not case["mdp"].is_dense

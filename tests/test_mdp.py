@@ -54,6 +54,22 @@ def test_restart_rows_alone_are_wide():
     np.testing.assert_array_equal(np.unique(mdp.predecessors.wide_row), [0])
 
 
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_expectations_over_wide_rows(is_shared, rng):
+    """Five pairs restart, among the same 24 states or each among others."""
+    transition, discount, initial, features = small_models.restart()
+    if not is_shared:
+        for state in range(95, 100):
+            transition[state, 2] = np.roll(transition[state, 2], state)
+    mdp = MDP.from_dense(transition, discount=discount, initial=initial, features=features)
+    assert (mdp.wide_successors is not None) == is_shared
+    if is_shared:
+        np.testing.assert_array_equal(mdp.wide_successors, np.arange(10, 34))
+    for value in (rng.normal(size=100), rng.normal(size=(100, 1)), rng.normal(size=(100, 4))):
+        expected = np.tensordot(transition, value, axes=1)
+        np.testing.assert_allclose(jax.jit(expected_next_value)(mdp, value), expected, rtol=0, atol=1e-14)
+
+
 def test_sizes_dtype_and_fields(case):
     mdp = case.mdp
     assert (mdp.num_states, mdp.num_actions) == case.shape

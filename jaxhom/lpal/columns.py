@@ -73,8 +73,9 @@ def solve_by_columns(
     on_cpu = jax.default_backend() == "cpu"
     # Two programs that both call LAPACK can wait for each other for ever (see `jaxhom.inverse_factor`).
     workers = num_cores() if on_cpu and not is_solved_by_lu(mdp) else 1
-    width = _NUMBERS_AT_A_TIME // mdp.num_states if on_cpu else _MAX_WIDTH
-    width = min(max(1, width), _MAX_WIDTH, -(-total // workers))
+    is_wide = mdp.is_dense or not on_cpu  # dense products read the same large matrix for any number of lanes
+    width = _MAX_WIDTH if is_wide else min(max(1, _NUMBERS_AT_A_TIME // mdp.num_states), _MAX_WIDTH)
+    width = min(width, -(-total // workers))
     host = tuple(None if array is None else np.asarray(array) for array in (initial_policy, initial_weights))
     bar = tqdm(disable=not progress, desc="LPAL", unit="column")
     with ThreadPoolExecutor(workers) as threads, ThreadPoolExecutor(1) as beside, bar:

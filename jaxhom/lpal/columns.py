@@ -16,8 +16,9 @@ in step, so that the answer does not depend on which thread is first.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -78,31 +79,66 @@ def solve_by_columns(
     width = min(width, -(-total // workers))
     host = tuple(None if array is None else np.asarray(array) for array in (initial_policy, initial_weights))
     bar = tqdm(disable=not progress, desc="LPAL", unit="column")
-    with ThreadPoolExecutor(workers) as threads, ThreadPoolExecutor(1) as beside, bar:
+    with ThreadPoolExecutor(workers) as threads, _Beside(helper, waits=workers == 1) as beside, bar:
         solver = _Solver(mdp, tolerance, width, workers, threads.map)
         lanes = [solver.start(number, given, *host) for number, given in enumerate(np.asarray(expectations))]
-        waiting, busy, away, rested = list(reversed(lanes)), [], [], []
-        while waiting or busy or away:
-            if not (waiting or busy):  # all come back at once, so that no thread decides who learns from whom
-                busy, away = [solver.take_back(lane, point.result()) for lane, point in away], []
+        waiting, busy = list(reversed(lanes)), []
+        while waiting or busy or beside.lanes:
+            if not (waiting or busy):
+                for lane, point in beside.give_back():
+                    busy.append(solver.take_back(lane, point))
+                    bar.update()
             while waiting and len(busy) < _LANES_AT_A_TIME * workers * width:
                 busy.append(waiting.pop())
             solver.respond_to(busy)
             solver.play_games(busy)
-            num_lanes = len(busy) + len(waiting) + len(away)
+            num_lanes = len(busy) + len(waiting) + len(beside.lanes)
             bar.set_postfix(gap=f"{max(lane.gap for lane in busy):.2e}", lanes=num_lanes, refresh=False)
             bar.update(len(busy))
             busy = [lane for lane in busy if not lane.is_done(tolerance, max_iterations)]
-            for lane in [lane for lane in busy if lane.is_at_rest(tolerance)] if helper else []:
-                lane.has_rested = True
-                rested.append(lane)
-                solve, share = helper() or (None, 0)
-                if solve and (len(rested) - 1) % share == 0:
-                    busy.remove(lane)
-                    away.append((lane, beside.submit(solve, lane.expectations)))
-                    if workers == 1:
-                        away[-1][1].result()
+            busy = beside.take_share_of(busy, tolerance)
         return solver.certify(mdp, lanes, max_iterations)
+
+
+class _Beside:
+    """Another method for lanes at rest, in a thread of its own while the other lanes go on with columns.
+
+    Its lanes come back together, when no other lane is left: otherwise the threads' speed would decide which lane
+    learns from which. With `waits`, the others stand still meanwhile.
+    """
+
+    def __init__(self, helper: Callable | None, waits: bool):
+        self._helper, self._waits, self._thread = helper, waits, ThreadPoolExecutor(1)
+        self.lanes, self._num_rested = [], 0
+
+    def __enter__(self) -> "_Beside":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._thread.shutdown(wait=False, cancel_futures=True)  # when interrupted, what waits is not begun
+
+    def take_share_of(self, busy: list["_Lane"], tolerance: float) -> list["_Lane"]:
+        """Begins with its share of the lanes that have come to rest, and returns the others."""
+        at_rest = [lane for lane in busy if lane.is_at_rest(tolerance)]
+        found = self._helper() if self._helper and at_rest else None
+        solve, share = found or (None, 1)
+        taken = []
+        for lane in at_rest:
+            lane.has_rested = True
+            if solve and self._num_rested % share == 0:
+                point = self._thread.submit(solve, lane.expectations)
+                taken.append((lane, point))
+                if self._waits:
+                    point.result()
+            self._num_rested += 1
+        self.lanes += taken
+        return [lane for lane in busy if lane not in dict(taken)]
+
+    def give_back(self) -> Iterator[tuple["_Lane", Any]]:
+        """The lanes, and what the method has found for each."""
+        lanes, self.lanes = self.lanes, []
+        for lane, point in lanes:
+            yield lane, point.result()
 
 
 @dataclasses.dataclass(eq=False)

@@ -2,7 +2,8 @@
 
 import pathlib
 
-from bench.speed_rows import COLOURS, MARKERS, Kind, is_batch, is_ours, is_settled, number
+from bench.speed_plot import Curves, draw_over_states
+from bench.speed_rows import Kind, is_batch, is_ours, is_settled, number
 
 SECTIONS = (  # the instances, small ones first
     *("grid16", "grid16_exact", "grid16_monte_carlo", "grid24", "bumps24", "grid32", "grid48", "grid48_exact"),
@@ -78,9 +79,9 @@ def _cells(row: dict | None, best: dict) -> list[str]:
     return [f"{seconds:.3g}", share, f"{peer / seconds:.2g} times" if peer and is_ours(row) else ""]
 
 
-def curves(rows: list[dict]) -> dict[tuple[str, bool], list[tuple[int, float]]]:
+def curves(rows: list[dict]) -> Curves:
     """For each method, alone and in a batch, (S, seconds per lane) of the instances with perturbed regions."""
-    found: dict[tuple[str, bool], list[tuple[int, float]]] = {}
+    found: Curves = {}
     for row in rows:
         if row["section"] in OVER_STATES and is_settled(row):
             point = (int(row["S"]), number(row, "seconds"))
@@ -89,26 +90,15 @@ def curves(rows: list[dict]) -> dict[tuple[str, bool], list[tuple[int, float]]]:
 
 
 def plot(rows: list[dict], path: pathlib.Path) -> None:
-    """Seconds per lane against states, both axes logarithmic; one colour per method, batches dashed."""
+    """Seconds per lane against states."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    lines = curves(rows)
-    methods = list(dict.fromkeys(method for method, _ in lines))
-    figure, axes = plt.subplots(figsize=(7.2, 4.8), layout="constrained")
-    for (method, batch), points in sorted(lines.items(), key=lambda item: (methods.index(item[0][0]), item[0][1])):
-        k = methods.index(method)
-        style = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
-        style |= {"linestyle": "--" if batch else "-", "markersize": 5, "alpha": 1.0 if k < len(COLOURS) else 0.5}
-        axes.loglog(*zip(*points, strict=True), label=method.replace("_", " ") + (", batch" if batch else ""), **style)
-    ticks = sorted({states for points in lines.values() for states, _ in points})
-    axes.set_xticks(ticks, [f"{states:,}" for states in ticks])
-    axes.minorticks_off()
-    axes.set(xlabel="states", ylabel="seconds per lane", title="LPAL to a certified gap of 1e-5 per step, two cores")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, ncols=2)
+    figure, axes = plt.subplots(figsize=(7.2, 5.6), layout="constrained")
+    draw_over_states(axes, curves(rows))
+    axes.set(ylabel="seconds per lane", title="LPAL to a certified gap of 1e-5 per step, two cores")
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

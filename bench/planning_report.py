@@ -2,7 +2,8 @@
 
 import pathlib
 
-from bench.speed_rows import COLOURS, MARKERS, Kind, is_batch, is_ours, is_settled, number
+from bench.speed_plot import Curves, draw_over_states
+from bench.speed_rows import Kind, is_batch, is_ours, is_settled, number
 
 SECTIONS = (
     *("grid16", "grid32", "grid48", "grid100", "grid316"),
@@ -59,39 +60,28 @@ def _line(row: dict, best: dict) -> str:
     return "| " + " | ".join([*cells, ratio, f"{compile_s:.1f}" if compile_s is not None else ""]) + " |"
 
 
-def curves(rows: list[dict], work: str) -> dict[tuple[str, bool], list[tuple[int, float]]]:
-    """For each method, alone and in a batch, (S, seconds per lane) of the grids."""
-    found: dict[tuple[str, bool], list[tuple[int, float]]] = {}
+def curves(rows: list[dict], work: str) -> Curves:
+    """For each package, alone and in a batch, (S, seconds per lane) of the fastest of its methods on the grids."""
+    found: dict[tuple[str, bool], dict[int, float]] = {}
     for row in rows:
         if row["work"] == work and row["section"].startswith("grid") and is_settled(row):
-            point = (int(row["S"]), number(row, "seconds"))
-            found.setdefault((row["method"], is_batch(row)), []).append(point)
-    return {name: sorted(points) for name, points in found.items()}
+            curve, states = found.setdefault((row["method"].split()[0], is_batch(row)), {}), int(row["S"])
+            curve[states] = min(curve.get(states, float("inf")), number(row, "seconds"))
+    return {name: sorted(curve.items()) for name, curve in found.items()}
 
 
 def plot(rows: list[dict], path: pathlib.Path) -> None:
-    """Seconds per lane against the grids' states, a panel for each kind of work; batches dashed."""
+    """Seconds per lane against the grids' states, a panel for each kind of work."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     works = [work for work in WORKS if curves(rows, work)]
-    figure, all_axes = plt.subplots(1, len(works), figsize=(5.2 * len(works), 4.6), squeeze=False, layout="constrained")
+    figure, all_axes = plt.subplots(1, len(works), figsize=(5.2 * len(works), 5.0), squeeze=False, layout="constrained")
     for axes, work in zip(all_axes[0], works, strict=True):
-        lines = curves(rows, work)
-        methods = list(dict.fromkeys(method for method, _ in lines))
-        for (method, batch), points in lines.items():
-            k = methods.index(method)
-            style = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "markersize": 5}
-            label = method.replace("_", " ") + (", batch" if batch else "")
-            axes.loglog(*zip(*points, strict=True), label=label, linestyle="--" if batch else "-", **style)
-        ticks = sorted({states for points in lines.values() for states, _ in points})
-        axes.set_xticks(ticks, [f"{states:,}" for states in ticks])
-        axes.minorticks_off()
-        axes.set(xlabel="states", title=WORKS[work])
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
+        draw_over_states(axes, curves(rows, work))
+        axes.set_title(WORKS[work])
     all_axes[0, 0].set_ylabel("seconds per lane")
     figure.savefig(path, dpi=130)
     plt.close(figure)

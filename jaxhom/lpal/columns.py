@@ -62,7 +62,7 @@ def solve_by_columns(
     initial_weights: jax.Array | None = None,
     max_iterations: int = 500,
     progress: bool = False,
-    helper: Callable[[], Callable | None] | None = None,
+    helper: Callable[[], tuple[Callable, int] | None] | None = None,
 ) -> LPALSolution:
     """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None, initial_weights [B, K] or None.
 
@@ -132,7 +132,8 @@ class _Beside:
                     point.result()
             self._num_rested += 1
         self.lanes += taken
-        return [lane for lane in busy if lane not in dict(taken)]
+        gone = {lane for lane, _ in taken}
+        return [lane for lane in busy if lane not in gone]
 
     def give_back(self) -> Iterator[tuple["_Lane", Any]]:
         """The lanes, and what the method has found for each."""

@@ -35,13 +35,14 @@ def solve_by_the_quickest(
     max_iterations: int | None = None,
     progress: bool = False,
 ) -> LPALSolution:
-    """`lpal` on a batch: expectations [B, K]. What is given to begin with, and a limit, are for columns."""
+    """`lpal` on a batch: expectations [B, K]. What is given to begin with is for columns, and a limit too."""
     limit = {} if max_iterations is None else {"max_iterations": max_iterations}
     by_columns = functools.partial(solve_by_columns, mdp, progress=progress, **limit)
     program = functools.cache(functools.partial(interior_point.Program, mdp))
-    if mdp.is_dense or mdp.dtype != jnp.float64 or mdp.num_features < _MANY_FEATURES:
+    is_for_columns = mdp.is_dense or mdp.dtype != jnp.float64 or mdp.num_features < _MANY_FEATURES
+    if is_for_columns or max_iterations is not None:  # a limit counts columns
         return by_columns(expectations, initial_policy, tolerance, initial_weights=initial_weights)
-    is_guided = any(given is not None for given in (initial_policy, initial_weights, max_iterations))
+    is_guided = initial_policy is not None or initial_weights is not None
     if is_guided or not _is_small(mdp, program):
         helper = functools.cache(functools.partial(_helper, program, tolerance))
         return by_columns(expectations, initial_policy, tolerance, initial_weights=initial_weights, helper=helper)

@@ -34,8 +34,8 @@ from jaxhom.lpal import LPALSolution, lpal
 from jaxhom.mdp import MDP
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
 from jaxhom.occupancy_regression import occupancy_regression
-from jaxhom.pdhg import Status
 from jaxhom.planning import Plan, optimal_policy
+from jaxhom.status import Status
 
 __version__ = "0.1.0"
 

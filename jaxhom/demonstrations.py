@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.mdp import MDP, check_policy_shape
+from jaxhom.inputs import as_model, check_policy
+from jaxhom.mdp import MDP, uniform_policy
 
 
 @chex.dataclass(frozen=True)
@@ -118,7 +119,7 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Arra
     visits = counts.sum(axis=-1, keepdims=True)
     visited = visits[:, 0] > 0
     frequencies = (counts / jnp.maximum(visits, 1.0)).astype(mdp.dtype)
-    return visited, jnp.where(visited[:, None], frequencies, 1.0 / mdp.num_actions)
+    return visited, jnp.where(visited[:, None], frequencies, uniform_policy(mdp))
 
 
 def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> jax.Array:
@@ -163,9 +164,8 @@ def sample_demonstrations(
     Raises:
       ValueError: if `policy` has another shape or a count is below 1.
     """
-    policy = jnp.asarray(policy, mdp.dtype)
-    check_policy_shape(mdp, policy)
-    checks.require_shape("policy", policy, "[S, A], not a batch", jnp.ndim(policy) == 2)
+    mdp = as_model(mdp)
+    policy = check_policy(mdp, policy, batch=False)
     if num_trajectories < 1 or horizon < 1:
         raise ValueError(f"num_trajectories and horizon must be at least 1, got {num_trajectories} and {horizon}")
     return _sample(key, mdp, policy, num_trajectories, horizon)

@@ -19,8 +19,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxhom import checks
-from jaxhom.mdp import MDP, check_policy_shape, expected_next_values, push_forward, state_transition
+from jaxhom.inputs import as_model, check_policy, check_reward, require_policy_shape
+from jaxhom.mdp import MDP, expected_next_values, push_forward, state_transition
 from jaxhom.policy_chain import policy_chain
 
 _MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
@@ -44,8 +44,8 @@ def occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
 
     Source: Boularias and Chaib-draa 2010, section II and eqs. (3)-(4).
     """
-    policy = jnp.asarray(policy, mdp.dtype)
-    check_policy_shape(mdp, policy)
+    mdp = as_model(mdp)
+    policy = check_policy(mdp, policy)
     if policy.ndim == 3:
         return jnp.moveaxis(_occupancy(mdp, jnp.moveaxis(policy, 0, -1)), -1, 0)
     return _occupancy(mdp, policy)
@@ -66,6 +66,7 @@ def feature_expectations(mdp: MDP, policy: jax.Array) -> jax.Array:
 
     Source: Boularias and Chaib-draa 2010, section II.
     """
+    mdp = as_model(mdp)
     return jnp.einsum("...sa,sak->...k", occupancy(mdp, policy), mdp.features)
 
 
@@ -85,10 +86,10 @@ def policy_value(mdp: MDP, policy: jax.Array, reward: jax.Array) -> jax.Array:
 
     Source: Boularias and Chaib-draa 2010, section II.
     """
-    policy, reward = jnp.asarray(policy, mdp.dtype), jnp.asarray(reward, mdp.dtype)
-    check_policy_shape(mdp, policy)
-    fits = reward.shape in (policy.shape, policy.shape[-2:])
-    checks.require_shape("reward", reward, f"{policy.shape[-2:]} or the policy's", fits)
+    mdp = as_model(mdp)
+    policy = require_policy_shape(mdp, policy)
+    reward = check_reward(mdp, reward, policy.shape)
+    policy = check_policy(mdp, policy)
     reward_under_policy = (policy * reward).sum(axis=-1)
     if policy.ndim == 3:
         batch_last = jnp.moveaxis(policy, 0, -1)

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxhom import checks
+from jaxhom.inputs import as_model
 from jaxhom.mdp import MDP, expected_next_value, expected_next_values
 from jaxhom.planning_sensitivity import with_derivatives
 from jaxhom.policy_chain import action_chains, saves_gathers
@@ -85,6 +86,7 @@ def optimal_policy(
 
     Source: Puterman 1994, section 6.6; the expert of Boularias and Chaib-draa 2010, section VI.
     """
+    mdp = as_model(mdp)
     reward, is_batch = _reward_batch(mdp, jnp.asarray(reward, mdp.dtype))
     if initial_value is None:
         initial_value = jnp.zeros((reward.shape[0], mdp.num_states), mdp.dtype)

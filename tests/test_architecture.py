@@ -15,11 +15,13 @@ PACKAGE = ROOT / "jaxhom"
 # The table of the design: a module imports only from rows with a smaller number than its own.
 # Inside a package (pdhg, lpal, domains, interop, plotting, cli) the modules may import one another, one way.
 ROWS = {
+    "status": -1,  # how an answer ended
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
     "canonical_forms": -1,  # arrays in, keys out
     "padded_rows": -1,  # arrays in, arrays out
     "policy_chain": -0.5,
     "mdp": 0,
+    "inputs": 0.5,
     "occupancy": 1,
     "planning_sensitivity": 1.1,
     "planning": 1.2,

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.inputs import check_policy
 from jaxhom.lpal.certificate import LPALSolution
 from jaxhom.lpal.columns import solve_by_columns
 from jaxhom.lpal.flow import solve_by_flow
@@ -25,7 +26,7 @@ from jaxhom.lpal.interior_point import solve_by_interior_point
 from jaxhom.lpal.presolve import reduce_expectations, restore
 from jaxhom.lpal.quickest import solve_by_the_quickest
 from jaxhom.lpal.sensitivity import with_derivatives, without_tangents
-from jaxhom.mdp import MDP, check_policy_shape
+from jaxhom.mdp import MDP
 
 _METHODS = {
     "auto": solve_by_the_quickest,
@@ -102,8 +103,7 @@ def lpal(
         if method in ("auto", "columns"):
             options["initial_weights"] = _guess("warm_start.weights", warm_start.weights, batch)
     if initial_policy is not None:
-        initial_policy = checks.as_host_array("initial_policy", initial_policy)
-        check_policy_shape(mdp, initial_policy, "initial_policy")
+        initial_policy = check_policy(mdp, initial_policy, "initial_policy")
         initial_policy = _guess("initial_policy", initial_policy, batch)
     if tolerance is None:
         scale = float(jnp.abs(mdp.features).max())

@@ -1,5 +1,7 @@
 """Best responses of LPAL on columns: the policy that is worth most for given weights, and its feature expectations."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ def with_compact_features(mdp: MDP) -> MDP:
     """The model with features [S, 1, K] where they do not depend on the action: a quarter of the numbers, with four."""
     features = np.asarray(mdp.features)
     depends = (features != features[:, :1]).any()
-    return mdp if depends else mdp.replace(features=jnp.asarray(features[:, :1]))
+    return mdp if depends else dataclasses.replace(mdp, features=jnp.asarray(features[:, :1]))
 
 
 @jax.jit

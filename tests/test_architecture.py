@@ -22,6 +22,8 @@ ROWS = {
     "policy_chain": -0.5,
     "mdp": 0,
     "inputs": 0.5,
+    "chain_solver": 0.5,
+    "host_chains": 0.5,
     "occupancy": 1,
     "planning_sensitivity": 1.1,
     "planning": 1.2,

@@ -25,13 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jaxhom.chain_solver import is_solved_by_lu
 from jaxhom.lane_queue import num_cores
 from jaxhom.lpal.certificate import LPALSolution, UpperBound, certify, policy_from_occupancy
 from jaxhom.lpal.column_games import capacities, play
 from jaxhom.lpal.policy_pool import PolicyPool
 from jaxhom.lpal.responses import evaluate, respond, with_compact_features
 from jaxhom.mdp import MDP
-from jaxhom.occupancy import is_solved_by_lu
 from jaxhom.pdhg import Status
 
 _PULLS = (0.3, 0.7)  # shares of the best bound's weights in a query; the second where a core would be idle

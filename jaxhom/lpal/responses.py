@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom.chain_solver import rough_state_occupancy
 from jaxhom.lpal.certificate import bound_by_planning
 from jaxhom.mdp import MDP
-from jaxhom.occupancy import rough_state_occupancy
 
 
 def with_compact_features(mdp: MDP) -> MDP:

@@ -24,6 +24,7 @@ from jaxhom.mdp import MDP
 
 _NARROW = 8.0  # bandwidth, in square roots of S, up to which elimination fills in little: roads, grids, corridors
 _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
+_FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _latest: dict = {}  # one entry at most
 
@@ -103,6 +104,14 @@ class HostModel:
     def is_narrow(self) -> bool:
         """Whether sparse LU is the quickest way: graphs like roads, grids and corridors."""
         return self.bandwidth <= _NARROW * np.sqrt(self.num_states)
+
+    def is_quickest(self, lanes: int) -> bool:
+        """Whether the host should be asked before the device: for few systems, small or near a discount of 1.
+
+        A program takes half a second to compile, and hundreds of products where the chain mixes slowly.
+        """
+        is_near_one = self.num_states <= _FEW_STATES or self.discount > _MODERATE_DISCOUNT
+        return lanes <= _FEW_LANES and is_near_one and self.is_narrow and self.is_solvable
 
     @property
     def is_solvable(self) -> bool:

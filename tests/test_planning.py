@@ -208,9 +208,9 @@ def test_batches_agree_with_single_rewards_lane_by_lane():
 
 def test_state_rewards_hold_for_every_action():
     case = small_models.case("dense")
-    rewards = np.random.default_rng(22).normal(size=(3, 7))
+    rewards = np.random.default_rng(22).normal(size=(4, 7))
     spread = np.repeat(rewards[..., None], 3, axis=2)
-    for state_reward, reward in ((rewards, spread), (rewards[0], spread[0])):
+    for state_reward, reward in ((rewards, spread), (rewards[0], spread[0]), (rewards[:3, :, None], spread[:3])):
         chex.assert_trees_all_equal(optimal_policy(case.mdp, state_reward), optimal_policy(case.mdp, reward))
 
 

@@ -105,13 +105,18 @@ class HostModel:
         """Whether sparse LU is the quickest way: graphs like roads, grids and corridors."""
         return self.bandwidth <= _NARROW * np.sqrt(self.num_states)
 
-    def is_quickest(self, lanes: int) -> bool:
-        """Whether the host should be asked before the device: for few systems, small or near a discount of 1.
+    def solves_sooner(self, lanes: int) -> bool:
+        """Whether the host should be asked before the device for so many linear systems.
 
         A program takes half a second to compile, and hundreds of products where the chain mixes slowly.
         """
-        is_near_one = self.num_states <= _FEW_STATES or self.discount > _MODERATE_DISCOUNT
-        return lanes <= _FEW_LANES and is_near_one and self.is_narrow and self.is_solvable
+        is_near_one = self.discount > _MODERATE_DISCOUNT
+        return (lanes <= _FEW_LANES or is_near_one) and self.is_narrow and self.is_solvable
+
+    def plans_sooner(self, lanes: int) -> bool:
+        """Whether the host should be asked first for the best policies of so many rewards."""
+        is_small = self.num_states <= _FEW_STATES or self.discount > _MODERATE_DISCOUNT
+        return lanes <= _FEW_LANES and is_small and self.is_narrow and self.is_solvable
 
     @property
     def is_solvable(self) -> bool:

@@ -129,7 +129,7 @@ def _solve_at_hand(mdp: MDP, policy: jax.Array, source: jax.Array, *, transpose:
     policies = np.asarray(policy).reshape(-1, mdp.num_states, mdp.num_actions)
     sources = np.broadcast_to(source, (len(policies), mdp.num_states))
     model = host_model(mdp)
-    if model.is_quickest(len(policies)):
+    if model.solves_sooner(len(policies)):
         solutions = np.full(sources.shape, np.nan)
     else:
         solve = _state_occupancy if transpose else _solve_values

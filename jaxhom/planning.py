@@ -178,7 +178,7 @@ def _plan_at_hand(mdp: MDP, reward, value, tolerance, *, max_iterations: int, is
     """The plan for concrete arrays, batch last: by sweeps on the device, policy iteration on the host, or both."""
     model, host_reward = host_model(mdp), np.asarray(reward, np.float64)
     lanes = reward.shape[-1]
-    if is_polished and max_iterations > 0 and model.is_quickest(lanes):
+    if is_polished and max_iterations > 0 and model.plans_sooner(lanes):
         expected = [model.expected_next_value(lane) for lane in np.asarray(value.T)]
         start = host_reward + model.discount * np.stack(expected, axis=-1)
         return _improve_on_host(model, host_reward, _empty_plan(mdp, lanes), start, np.arange(lanes), max_iterations)

@@ -27,6 +27,8 @@ ROWS = {
     "occupancy": 1,
     "planning_sensitivity": 1.1,
     "planning": 1.2,
+    "impossible_steps": 0.6,
+    "episode_ends": 0.6,
     "demonstrations": 1,
     "local_models": 1,
     "lane_queue": 0.5,

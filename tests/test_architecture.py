@@ -45,6 +45,7 @@ ROWS = {
     "homomorphism_map": 2,
     "certified_maps": 2,
     "lpal": 2,
+    "evidence": 2,
     "votes": 2,
     "explanation": 2.3,
     "explainers": 2.6,

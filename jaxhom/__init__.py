@@ -30,6 +30,7 @@ from jaxhom.homomorphism import (
     locally_similar,
 )
 from jaxhom.homomorphism_map import homomorphism_map
+from jaxhom.impossible_steps import ImpossibleStepsWarning
 from jaxhom.lpal import LPALSolution, lpal
 from jaxhom.mdp import MDP
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
@@ -46,6 +47,7 @@ __all__ = [
     "Explanation",
     "Generalization",
     "Gridworld",
+    "ImpossibleStepsWarning",
     "LPALSolution",
     "LocalSimilarity",
     "Plan",

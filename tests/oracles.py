@@ -93,12 +93,18 @@ def empirical_policy(num_states, num_actions, trajectories):
     return visited, policy
 
 
-def monte_carlo_feature_expectations(features, discount, trajectories):
-    """Eq. (6) [K]: Vhat_i = 1/M sum_m sum_t discount^t phi_i(s_t, a_t), the first t being 0."""
+def monte_carlo_feature_expectations(features, discount, trajectories, ends=None):
+    """Eq. (6) [K]: Vhat_i = 1/M sum_m sum_t discount^t phi_i(s_t, a_t), the first t being 0.
+
+    `ends[m]`, if it is not None, is the distribution [S] of the state in which trajectory m is absorbed after its last
+    step: from there on every action is as likely as any other.
+    """
     total = np.zeros(features.shape[2])
-    for states, actions in trajectories:
+    for m, (states, actions) in enumerate(trajectories):
         for t, (s, a) in enumerate(zip(states, actions, strict=True)):
             total += discount**t * features[s, a]
+        if ends is not None and ends[m] is not None:
+            total += discount ** len(states) / (1 - discount) * ends[m] @ features.mean(axis=1)
     return total / len(trajectories)
 
 
@@ -129,6 +135,12 @@ def successors(transition, s):
 def grow(transition, states):
     """The set s^(t+1) from the set s^t: `states` and all their successors."""
     return set(states).union(*(successors(transition, s) for s in states))
+
+
+def absorbing(transition):
+    """bool [S]: the states that no action leaves; what was done there is no evidence for other states."""
+    states = np.arange(len(transition))
+    return (transition[states, :, states] > 1 - 1e-12).all(axis=1)
 
 
 def reach(transition, s, steps):
@@ -256,8 +268,9 @@ def algorithm1(
         return one_way and (not mutual or error(other, s) <= threshold + tolerance)
 
     policy, radius = empirical.copy(), np.zeros(num_states, dtype=int)
+    voters = visited & ~absorbing(transition)
     for s in np.flatnonzero(~visited).tolist():
-        policy[s], radius[s] = _vote(transition, s, visited, empirical, similar)
+        policy[s], radius[s] = _vote(transition, s, voters, empirical, similar)
     return policy, radius
 
 
@@ -270,8 +283,9 @@ def hops_nearest_neighbors(transition, trajectories):
     num_states, num_actions, _ = transition.shape
     visited, empirical = empirical_policy(num_states, num_actions, trajectories)
     policy, radius = empirical.copy(), np.zeros(num_states, dtype=int)
+    voters = visited & ~absorbing(transition)
     for s in np.flatnonzero(~visited).tolist():
-        policy[s], radius[s] = _vote(transition, s, visited, empirical, lambda s, other: True)
+        policy[s], radius[s] = _vote(transition, s, voters, empirical, lambda s, other: True)
     return policy, radius
 
 
@@ -293,18 +307,19 @@ def _vote(transition, s, visited, empirical, similar):
         previous = current
 
 
-def euclidean_nearest_neighbors(coordinates, num_actions, trajectories):
+def euclidean_nearest_neighbors(coordinates, num_actions, trajectories, absorbs=False):
     """Euclidean k-NN on `coordinates` [S, 2]: (policy [S, A], distance float [S]).
 
-    All demonstrated states at the distance of the nearest one vote (ties up to rounding).
+    All demonstrated states at the distance of the nearest one vote (ties up to rounding), but for those that absorb,
+    bool [S].
     """
     coordinates = np.asarray(coordinates, dtype=float)
     visited, empirical = empirical_policy(len(coordinates), num_actions, trajectories)
     policy, nearest = empirical.copy(), np.zeros(len(coordinates))
     for s in np.flatnonzero(~visited):
         distances = np.sqrt(np.sum((coordinates - coordinates[s]) ** 2, axis=1))
-        nearest[s] = distances[visited].min()
-        voters = visited & (distances <= nearest[s] * (1 + 1e-9))
+        nearest[s] = distances[visited & ~np.asarray(absorbs)].min()
+        voters = visited & ~np.asarray(absorbs) & (distances <= nearest[s] * (1 + 1e-9))
         policy[s] = empirical[voters].mean(axis=0)
     return policy, nearest
 

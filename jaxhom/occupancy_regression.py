@@ -22,7 +22,7 @@ from jaxhom import checks
 from jaxhom.demonstrations import Demonstrations, empirical_policy
 from jaxhom.explainers import ByOccupancy
 from jaxhom.generalization import Generalization
-from jaxhom.mdp import MDP
+from jaxhom.mdp import MDP, uniform_policy
 from jaxhom.normal_equations import Rows, flow_matrix
 from jaxhom.sparse_interior_point import solve
 
@@ -54,10 +54,11 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
     checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
     basis = quadratic_basis(checks.require_floats("coordinates", coordinates))
     visited, empirical = (np.asarray(array) for array in empirical_policy(mdp, demonstrations))
-    x = _solve(mdp, basis, _expansion(visited, empirical)).reshape(empirical.shape)
+    allowed = np.asarray(mdp.allowed)
+    x = _solve(mdp, basis, _expansion(visited, empirical, allowed)).reshape(empirical.shape)
     total = x.sum(axis=1, keepdims=True)
     occurs = total[:, 0] > _NO_OCCUPANCY / (1.0 - float(mdp.discount))
-    policy = np.where(occurs[:, None], x / np.where(total > 0, total, 1.0), 1.0 / mdp.num_actions)
+    policy = np.where(occurs[:, None], x / np.where(total > 0, total, 1.0), np.asarray(uniform_policy(mdp)))
     found = np.where(occurs, 1, -1)
     return Generalization(
         policy=jnp.asarray(np.where(visited[:, None], empirical, policy), mdp.dtype),
@@ -78,13 +79,13 @@ def quadratic_basis(coordinates: np.ndarray) -> np.ndarray:
     return left[:, size > 1e-10 * size[0]]
 
 
-def _expansion(visited: np.ndarray, empirical: np.ndarray) -> scipy.sparse.csr_array:
-    """[S A, m]: x as a function of mu(s) on demonstrated states and of x(s, a) on the others."""
+def _expansion(visited: np.ndarray, empirical: np.ndarray, allowed: np.ndarray) -> scipy.sparse.csr_array:
+    """[S A, m]: x as a function of mu(s) on demonstrated states and of the allowed x(s, a) on the others."""
     num_states, num_actions = empirical.shape
     state = np.repeat(np.arange(num_states), num_actions)
     demonstrated = scipy.sparse.csr_array((empirical.ravel(), (np.arange(empirical.size), state)))
     others = scipy.sparse.eye_array(empirical.size, format="csr")
-    return scipy.sparse.hstack([demonstrated[:, visited], others[:, ~visited[state]]], format="csr")
+    return scipy.sparse.hstack([demonstrated[:, visited], others[:, ~visited[state] & allowed.ravel()]], format="csr")
 
 
 def _solve(mdp: MDP, basis: np.ndarray, expansion) -> np.ndarray:

@@ -38,6 +38,7 @@ _METHODS = {
 }
 
 _LARGEST = 2.0**-20  # share of the largest number of a type: what sums of expectations may need stays within it
+_FLOAT32_GOAL = 0.5  # share of the tolerance that methods aim for: the rest is for what the model's rounding hides
 
 __all__ = ["LPALSolution", "lpal"]
 
@@ -72,12 +73,12 @@ def lpal(
         second opinion, slower, for models whose graph is a narrow band or that have up to a few thousand states.
       max_iterations: what to stop after, per lane, whichever method runs; `status` is then ITERATION_LIMIT. It counts
         columns, that is best responses ("columns", default 500), interior-point steps ("interior_point", 100), both
-        together ("auto", 500) or PDHG iterations ("flow", in sixteens; default 20,000, one to seven thousand are usual).
+        together ("auto", 500) or PDHG iterations ("flow", in sixteens; 20,000, one to seven thousand are usual).
       progress: show a progress bar of the largest gap.
 
     Returns:
-      `LPALSolution`, with a leading axis [B] if the expectations have one. Its bounds hold whatever the status: they are
-      computed in float64 from the policy and the weights that are returned, rounding included. STALLED says that
+      `LPALSolution`, with a leading axis [B] if the expectations have one. Its bounds hold whatever the status: they
+      are computed in float64 from the policy and the weights that are returned, rounding included. STALLED says that
       rounding keeps them further apart than the tolerance.
       Under `jax.grad` and `jax.jvp`, but not under jit or vmap, `margin` and `margin_bound` have the derivative of the
       best margin with respect to expectations and to the model's probability, initial, features and discount
@@ -131,8 +132,11 @@ def _solve(mdp: MDP, expectations: np.ndarray, initial_policy, tolerance, method
     features = np.asarray(mdp.features)
     unit = float(np.exp2(np.floor(np.log2(np.abs(features).max() or 1.0))))  # a power of two changes no digit
     certify = Certifier(mdp, expectations, tolerance, reduction, unit)
-    scaled = mdp if unit == 1.0 else dataclasses.replace(mdp, features=jnp.asarray(features / features.dtype.type(unit)))
-    found = method(scaled, reduction.expectations / unit, initial_policy, tolerance / unit, certify, **options)
+    scaled = (
+        mdp if unit == 1.0 else dataclasses.replace(mdp, features=jnp.asarray(features / features.dtype.type(unit)))
+    )
+    goal = tolerance / unit if mdp.dtype == jnp.float64 else _FLOAT32_GOAL * tolerance / unit
+    found = method(scaled, reduction.expectations / unit, initial_policy, goal, certify, **options)
     return jax.tree.map(jnp.asarray, found)
 
 

@@ -1,8 +1,9 @@
 """What all LPAL methods return, and the two sides of its certificate.
 
 Any policy bounds v* from below by its margin min_i V_i(pi) - Vhat_i, one linear solve. Any w in the simplex bounds it
-from above by max_pi w . V(pi) - w . Vhat, one planning problem. Neither relies on how pi or w were found. Methods look at
-both as they go, in the model's type; what is returned is computed in float64 (`jaxhom.lpal.exact`), and rounded outwards.
+from above by max_pi w . V(pi) - w . Vhat, one planning problem. Neither relies on how pi or w were found. Methods look
+at both as they go, in the model's type; what is returned is computed in float64 (`jaxhom.lpal.exact`) and rounded
+outwards.
 """
 
 import chex

@@ -72,9 +72,9 @@ def solve_by_columns(
     """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None, initial_weights [B, K] or None.
 
     `helper()`, called once a lane is at rest, is None or (solve, n): another method for every n-th of such lanes, that
-    takes expectations [K], a tolerance and `max_iterations` and returns `jaxhom.lpal.interior_point.Point`, whose policy
-    becomes a column and whose weights the next query. It runs beside the columns of the other lanes. `spent` [B] are
-    iterations that count already.
+    takes expectations [K], a tolerance and `max_iterations` and returns `jaxhom.lpal.interior_point.Point`, whose
+    policy becomes a column and whose weights the next query. It runs beside the columns of the other lanes. `spent` [B]
+    are iterations that count already.
     """
     limit = DEFAULT_COLUMNS if max_iterations is None else max_iterations
     total = len(expectations)
@@ -87,7 +87,9 @@ def solve_by_columns(
     bar = tqdm(disable=not progress, desc="LPAL", unit="column")
     with ThreadPoolExecutor(workers) as threads, _Beside(helper, limit, waits=workers == 1) as beside, bar:
         solver = _Solver(mdp, tolerance, width, workers, threads.map, limit)
-        lanes = [solver.start(number, given, initial_policy, initial_weights) for number, given in enumerate(expectations)]
+        lanes = [
+            solver.start(number, given, initial_policy, initial_weights) for number, given in enumerate(expectations)
+        ]
         for lane, made in zip(lanes, () if spent is None else spent, strict=False):
             lane.made = int(made)
         waiting, busy = list(reversed(lanes)), []
@@ -256,7 +258,9 @@ class _Solver:
 
     def _add_policy(self, lane: _Lane, policy: np.ndarray) -> None:
         """A column of a policy [S, A]."""
-        evaluated = evaluate(self.mdp, policy) if self.exact is None else evaluate_on_host(self.exact, policy, self.error)
+        evaluated = (
+            evaluate(self.mdp, policy) if self.exact is None else evaluate_on_host(self.exact, policy, self.error)
+        )
         mu, expected = map(np.asarray, evaluated)
         if np.isfinite(expected).all():
             lane.add([self.pool.add(mu, np.asarray(policy), expected)], self.room)

@@ -1,12 +1,12 @@
 """The two sides of LPAL's certificate, computed on the host in float64 with everything that rounding may hide.
 
-Solvers propose; what they report is computed here, from the policy and the weights alone, so that the bounds of float32
-models are as good as those of float64 ones. Rows of float32 tables miss the sum 1 by 1e-8, which near a discount of 1 is
-not little: bounds are made for the rows as they should be and for the rows as they are (`as_stored`).
+Solvers propose; what they report is computed here, from the policy and the weights alone, whatever the model's type.
+Rows of float32 tables miss the sum 1 by 1e-8, which near a discount of 1 is not little: bounds are made for the rows as
+they should be and for the rows as they are (`as_stored`).
 
 Below. For any guess mu of a policy's state occupancy, with x = mu pi and what misses in the flow,
-r = alpha + gamma T^T x - mu, the expectations are V_i(pi) = phi_i . x + r . v_i, where v_i, the value of feature i, is at
-most max |phi_i| / (1 - gamma): the error is at most |r|_1 max |phi_i| / (1 - gamma).
+r = alpha + gamma T^T x - mu, the expectations are V_i(pi) = phi_i . x + r . v_i, where v_i, the value of feature i, is
+at most max |phi_i| / (1 - gamma): the error is at most |r|_1 max |phi_i| / (1 - gamma).
 
 Above. For any values V and b = max_a (r + gamma T V) - V, the optimal value is at most V + max_s b / (1 - gamma)
 (Puterman 1994, section 6.6), and at least V + min_s b / (1 - gamma).
@@ -26,7 +26,7 @@ _EPS = np.finfo(np.float64).eps
 _DIRECT = 4e6  # states times bandwidth, up to which LU is quick
 _ENOUGH = 0.05  # share of the tolerance that errors may take without another attempt
 _ROUNDINGS = 16.0  # by which a row may miss 1 before that is looked at
-_MAX_IMPROVEMENTS = 100
+_MAX_IMPROVEMENTS = 200
 _MAX_KRYLOV_STEPS, _KRYLOV_RESIDUAL = 500, 1e-13
 
 
@@ -34,7 +34,8 @@ class Exact:
     """A model's policies and rewards, evaluated on the host.
 
     Attributes:
-      model: the `jaxhom.host_chains.HostModel`. initial: [S]. features: [S A, K], or [S, K] where they do not depend on the action.
+      model: the `jaxhom.host_chains.HostModel`. rows: [S A, S], its transitions, or those as they are stored.
+      initial: [S]. features: [S A, K], or [S, K] where they do not depend on the action.
       size: [K], the largest |feature|. time: least and most discounted time, sum(initial) / (1 - gamma).
       allowed: bool [S, A].
     """
@@ -53,7 +54,11 @@ class Exact:
         self._most = 1.0 / (1.0 - kept.max())
         rows = self.model.rows
         if total is not None:
-            rows = (scipy.sparse.diags_array(total) @ rows).tocsr() if scipy.sparse.issparse(rows) else total[:, None] * rows
+            rows = (
+                (scipy.sparse.diags_array(total) @ rows).tocsr()
+                if scipy.sparse.issparse(rows)
+                else total[:, None] * rows
+            )
         self.rows = rows
         if scipy.sparse.issparse(rows):
             self._out, self._in = np.diff(rows.indptr).max(), np.bincount(rows.indices).max()
@@ -115,38 +120,37 @@ class Exact:
           (bound, value [S], actions [S]): the policy of the actions is optimal up to what is open between the bound and
           its own value; no policy is worth more than the bound.
         """
-        reward = self._reward(weights)
+        reward, start = self._reward(weights), np.zeros(len(self.initial))
         size = np.abs(reward).max() + (len(weights) + 2) * _EPS * (weights @ self.size)
-        best = (np.inf, np.zeros(len(self.initial)), np.where(self.allowed, reward, -np.inf).argmax(axis=1))
+        best, states = np.inf, np.arange(len(start))
         if value is not None and np.isfinite(value).all():
-            bound, open_, greedy = self._bound(reward, size, value, None, len(weights))
-            if bound < best[0]:
-                best = (bound, value, greedy)
+            best, open_, greedy = self._bound(reward, size, value, None, len(weights))
             if open_ <= _ENOUGH * tolerance:
-                return best
-            actions = greedy if actions is None else actions
-        actions = best[2] if actions is None else actions
-        states, idle = np.arange(len(actions)), 0
+                return best, value, greedy
+            start, actions = value, greedy if actions is None else actions
+        if actions is None:
+            actions = np.where(self.allowed, reward, -np.inf).argmax(axis=1)
+        value = start
         for _ in range(_MAX_IMPROVEMENTS):
-            start = best[1]
-            value = self._solve(actions, reward[states, actions], start, is_flow=False)
-            if not np.isfinite(value).all():
+            found = self._solve(actions, reward[states, actions], value, is_flow=False)
+            if not np.isfinite(found).all():
                 break
+            value = found
             bound, open_, greedy = self._bound(reward, size, value, actions, len(weights))
-            idle = 0 if bound < best[0] else idle + 1
-            if bound < best[0]:
-                best = (bound, value, greedy)
-            if open_ <= _ENOUGH * tolerance or idle > 2 or (greedy == actions).all():
+            best = min(best, bound)
+            if open_ <= _ENOUGH * tolerance or (greedy == actions).all():
                 break
             actions = greedy
-        return best
+        if not np.isfinite(best):
+            best, _, actions = self._bound(reward, size, value, None, len(weights))
+        return best, value, actions
 
     def _reward(self, weights) -> np.ndarray:
         reward = (self.features @ weights).reshape(len(self.initial), -1)
         return np.broadcast_to(reward, self.allowed.shape)
 
     def _bound(self, reward, size, value, actions, num_features):
-        """The bound that values prove, what may be open below it, and the better actions; those given where they are."""
+        """The bound that values prove, what may be open below it, and better actions; those given where none are."""
         action_value = reward + self.discount * (self.rows @ value).reshape(self.allowed.shape)
         action_value = np.where(self.allowed, action_value, -np.inf)
         greedy = action_value.argmax(axis=1)
@@ -163,7 +167,7 @@ class Exact:
         return bound, most * (top - gain.min()), greedy
 
     def _solve(self, policy, right, start, *, is_flow: bool) -> np.ndarray:
-        """Solves (I - gamma P_pi) x = right, for a flow with P_pi^T; policy [S, A] or actions [S]. Wrong where it fails."""
+        """Solves (I - gamma P_pi) x = right, or with P_pi^T; policy [S, A] or actions [S]. Nobody vouches for x."""
         if self.is_direct and not self._is_given:
             chain = self.model.chain(policy)
             return chain.state_occupancy(right) if is_flow else chain.value(right)

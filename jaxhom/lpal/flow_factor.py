@@ -48,7 +48,7 @@ def factor_flow(mdp: MDP, features: np.ndarray) -> FlowProjection:
 
 
 def _factor(normal, blocks) -> BlockCholesky:
-    """With as little regularisation as rounding asks for: a projection that is not exact still leads to certificates."""
+    """With as little regularisation as rounding asks for: certificates do not need exact projections."""
     for share in _REGULARISATIONS:
         try:
             return BlockCholesky(normal, blocks, share)

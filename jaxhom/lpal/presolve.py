@@ -45,8 +45,12 @@ class Reduction:
         Weight on an idle feature goes to the scarcest one, which is smaller for every policy: the bound that it proves
         can only get better.
         """
-        kept = np.where(self.is_idle[lane], 0.0, weights)
-        kept[self.scarcest[lane]] += weights[self.is_idle[lane]].sum()
+        idle, to = self.is_idle[lane], self.scarcest[lane]
+        if not idle.any():
+            return weights
+        kept = np.where(idle, 0.0, weights)
+        kept[to] = 0.0
+        kept[to] = max(0.0, 1.0 - kept.sum())
         return kept
 
 

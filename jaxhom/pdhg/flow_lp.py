@@ -182,10 +182,10 @@ class FlowProblem:
 def project_weighted_simplex(point: jax.Array, share: jax.Array, total: float) -> jax.Array:
     """argmin_q |q - point|^2 subject to q >= 0, share . q = total; [K, lanes], share [K] positive.
 
-    q = max(point - t share, 0), with t found by bisection among the values at which entries become 0.
+    q = max(point - t share, 0), with t found from the values of t at which entries become 0.
     """
     share = share[:, None]
-    knots = jnp.sort(point / share, axis=0)
+    knots = point / share
 
     def amount(t):
         return (share * jnp.maximum(point - t * share, 0.0)).sum(axis=0)
@@ -193,7 +193,7 @@ def project_weighted_simplex(point: jax.Array, share: jax.Array, total: float) -
     # The mass falls with t: the last knot at which it is not yet below the total, and from there a straight line.
     amounts = jax.lax.map(amount, knots)
     reaches = jnp.where(amounts >= total, knots, -jnp.inf).max(axis=0)
-    is_active = point > jnp.where(jnp.isfinite(reaches), reaches, -jnp.inf) * share
+    is_active = knots > reaches
     slope = jnp.where(is_active, share * share, 0.0).sum(axis=0)
     t = (jnp.where(is_active, share * point, 0.0).sum(axis=0) - total) / jnp.maximum(slope, jnp.finfo(point.dtype).tiny)
     return jnp.maximum(point - t * share, 0.0)

@@ -24,6 +24,7 @@ from jaxhom.mdp import MDP
 
 _NARROW = 8.0  # bandwidth, in square roots of S, up to which elimination fills in little: roads, grids, corridors
 _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
+_FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _latest: dict = {}  # one entry at most
 
@@ -57,8 +58,7 @@ class HostModel:
         self.discount = float(mdp.discount)
         pairs = self.num_states * self.num_actions
         probability = np.asarray(mdp.probability, np.float64).reshape(pairs, -1)
-        total = probability.sum(axis=1)
-        probability = probability / np.where(total > 0, total, 1.0)[:, None]
+        probability = probability / _or_one(probability.sum(axis=1))[:, None]
         if mdp.is_dense:
             self.rows = probability
             return
@@ -104,6 +104,19 @@ class HostModel:
         """Whether sparse LU is the quickest way: graphs like roads, grids and corridors."""
         return self.bandwidth <= _NARROW * np.sqrt(self.num_states)
 
+    def solves_sooner(self, lanes: int) -> bool:
+        """Whether the host should be asked before the device for so many linear systems.
+
+        A program takes half a second to compile, and hundreds of products where the chain mixes slowly.
+        """
+        is_near_one = self.discount > _MODERATE_DISCOUNT
+        return (lanes <= _FEW_LANES or is_near_one) and self.is_narrow and self.is_solvable
+
+    def plans_sooner(self, lanes: int) -> bool:
+        """Whether the host should be asked first for the best policies of so many rewards."""
+        is_small = self.num_states <= _FEW_STATES or self.discount > _MODERATE_DISCOUNT
+        return lanes <= _FEW_LANES and is_small and self.is_narrow and self.is_solvable
+
     @property
     def is_solvable(self) -> bool:
         """Whether a factor fits into memory."""
@@ -114,19 +127,24 @@ class HostChain:
     """One chain P_pi, factorised: solves with I - gamma P_pi and with its transpose."""
 
     def __init__(self, transition, discount: float):
-        is_sparse = scipy.sparse.issparse(transition)
-        diagonal = scipy.sparse.diags_array if is_sparse else np.diag
-        total = np.asarray(transition.sum(axis=1)).ravel()
-        transition = diagonal(1.0 / np.where(total > 0, total, 1.0)) @ transition
-        self._transition, self._discount = transition, discount
-        leaving = transition - diagonal(transition.diagonal())
-        keeps = (1.0 - discount) + discount * np.asarray(leaving.sum(axis=1)).ravel()
-        system = diagonal(keeps) - discount * leaving
-        if not is_sparse:
-            self._factor = scipy.linalg.lu_factor(system)
+        self._discount = discount
+        if not scipy.sparse.issparse(transition):
+            self._transition = transition / _or_one(transition.sum(axis=1))[:, None]
+            leaving = self._transition - np.diag(self._transition.diagonal())
+            keeps = (1.0 - discount) + discount * leaving.sum(axis=1)
+            self._factor = scipy.linalg.lu_factor(np.diag(keeps) - discount * leaving)
             return
-        # What is stored by rows is the transpose by columns, as SuperLU wants it. No pivoting: the diagonal dominates.
-        columns = scipy.sparse.csc_array(system.tocsr().T)
+        size, pointers, successor = transition.shape[0], transition.indptr, transition.indices
+        states = np.arange(size)
+        state = np.repeat(states, np.diff(pointers))
+        chance = transition.data / _or_one(np.bincount(state, transition.data, size))[state]
+        self._transition = scipy.sparse.csr_array((chance, successor, pointers), shape=transition.shape)
+        leaves = successor != state
+        keeps = (1.0 - discount) + discount * np.bincount(state[leaves], chance[leaves], size)
+        numbers = np.concatenate([-discount * chance[leaves], keeps])
+        row, column = np.append(state[leaves], states), np.append(successor[leaves], states)
+        # The transpose, by columns as SuperLU wants it. No pivoting: the diagonal dominates.
+        columns = scipy.sparse.csc_array((numbers, (column, row)), shape=transition.shape)
         self._factor = scipy.sparse.linalg.splu(
             columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
@@ -154,3 +172,8 @@ class HostChain:
         if isinstance(self._factor, tuple):
             return scipy.linalg.lu_solve(self._factor, right, trans=1 if is_flow else 0)
         return self._factor.solve(right, "N" if is_flow else "T")
+
+
+def _or_one(total: np.ndarray) -> np.ndarray:
+    """Sums to divide by; 1 where nothing was added up."""
+    return np.where(total > 0, total, 1.0)

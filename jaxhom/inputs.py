@@ -73,7 +73,9 @@ def check_reward(mdp: MDP, reward, policy_shape: tuple[int, ...]) -> jax.Array:
       ValueError: if the shape does not fit, or a concrete value is not finite.
     """
     pair = (mdp.num_states, mdp.num_actions)
-    good = jnp.shape(reward) in (pair, tuple(policy_shape))
+    if not checks.is_traced(reward):
+        reward = checks.as_host_array("reward", reward)
+    good = reward.shape in (pair, tuple(policy_shape))
     checks.require_shape("reward", reward, f"{pair} or the policy's", good)
     return check_reward_values(mdp, reward)
 

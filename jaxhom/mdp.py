@@ -33,6 +33,7 @@ from jaxhom.padded_rows import PaddedRows, gather_sum, narrow_width, pad_rows
 from jaxhom.policy_chain import Edges, find_edges
 
 _REPLACEABLE = ("discount", "initial", "features", "probability", "allowed")
+_MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one: programs would take minutes to compile
 _DENSE_FRACTION = 0.25  # dense layout from N >= S / 4 on, where products beat gathers
 
 
@@ -257,6 +258,8 @@ def expected_next_value(mdp: MDP, value: jax.Array) -> jax.Array:
     """The backward map: E[value(s') | s, a], [S] -> [S, A] or [S, B] -> [S, A, B]."""
     if mdp.is_dense:
         return jnp.tensordot(mdp.probability, value, axes=1)
+    if mdp.num_actions > _MAX_UNROLLED_ACTIONS:
+        return gather_sum(*_narrow_rows(mdp, value))
     return jnp.stack(expected_next_values(mdp, value), axis=1)
 
 
@@ -270,6 +273,12 @@ def expected_next_values(mdp: MDP, value: jax.Array) -> list[jax.Array]:
         return list(jnp.moveaxis(expected_next_value(mdp, value), 1, 0))
     if value.ndim == 2 and value.shape[1] == 1:  # gathers of single numbers, not of rows of one
         return [expected[:, None] for expected in expected_next_values(mdp, value[:, 0])]
+    index, weight, value = _narrow_rows(mdp, value)
+    return [gather_sum(index[:, a], weight[:, a], value) for a in range(mdp.num_actions)]
+
+
+def _narrow_rows(mdp: MDP, value: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Indices and weights [S, A, W], and the values that they read: E[value(s') | s, a] is their `gather_sum`."""
     width, slots = mdp.narrow_width, mdp.next_state.shape[-1]
     index, weight = mdp.next_state[..., :width], mdp.probability[..., :width]
     if mdp.wide_pairs.size:
@@ -284,7 +293,7 @@ def expected_next_values(mdp: MDP, value: jax.Array) -> list[jax.Array]:
         index = _replace_pairs(index, mdp.wide_pairs, jnp.where(first, lookup[:, None], 0))
         weight = _replace_pairs(weight, mdp.wide_pairs, first.astype(weight.dtype))
         value = jnp.concatenate([value, expectation])
-    return [gather_sum(index[:, a], weight[:, a], value) for a in range(mdp.num_actions)]
+    return index, weight, value
 
 
 def _replace_pairs(rows: jax.Array, pairs: jax.Array, replacement: jax.Array) -> jax.Array:

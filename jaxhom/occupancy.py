@@ -25,9 +25,6 @@ from jaxhom.host_chains import host_model, is_at_hand
 from jaxhom.inputs import as_model, check_policy, check_reward, require_policy_shape
 from jaxhom.mdp import MDP
 
-# What the host solves before the device is asked: few lanes, of small models or where iterations take long.
-_FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
-
 
 def occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
     """Discounted state-action occupancy x(s, a) = E sum_t gamma^t 1[s_t = s, a_t = a].
@@ -132,8 +129,7 @@ def _solve_at_hand(mdp: MDP, policy: jax.Array, source: jax.Array, *, transpose:
     policies = np.asarray(policy).reshape(-1, mdp.num_states, mdp.num_actions)
     sources = np.broadcast_to(source, (len(policies), mdp.num_states))
     model = host_model(mdp)
-    is_near_one = mdp.num_states <= _FEW_STATES or model.discount > _MODERATE_DISCOUNT
-    if len(policies) <= _FEW_LANES and is_near_one and model.is_narrow and model.is_solvable:
+    if model.solves_sooner(len(policies)):
         solutions = np.full(sources.shape, np.nan)
     else:
         solve = _state_occupancy if transpose else _solve_values

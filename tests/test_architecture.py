@@ -25,6 +25,7 @@ ROWS = {
     "chain_solver": 0.5,
     "host_chains": 0.5,
     "occupancy": 1,
+    "policy_iteration": 1.05,
     "planning_sensitivity": 1.1,
     "planning": 1.2,
     "demonstrations": 1,

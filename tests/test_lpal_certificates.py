@@ -57,9 +57,8 @@ def bounds_on_best(arrays, allowed, expectations):
     time, pairs = 1.0 / (1.0 - discount), np.flatnonzero(allowed)
     unit = np.abs(features).max(axis=(0, 1))
     unit = np.where(unit > 0, unit, 1.0)
-    flow = (
-        np.repeat(np.eye(len(initial)), features.shape[1], axis=1) - discount * transition.reshape(-1, len(initial)).T
-    )
+    num_states, num_actions, num_features = features.shape
+    flow = np.repeat(np.eye(num_states), num_actions, axis=1) - discount * transition.reshape(-1, num_states).T
     phi = features.reshape(-1, num_features)[pairs] / unit
     program = {
         "c": np.append(np.zeros(len(pairs)), -1.0),

@@ -34,6 +34,7 @@ ROWS = {
     "interior_point": 1.3,
     "normal_equations": 1.2,
     "sparse_interior_point": 1.3,
+    "host_certificates": 1.4,
     "brackets": 1.6,
     "homomorphism": 2,
     "homomorphism_map": 2,

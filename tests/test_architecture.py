@@ -17,6 +17,7 @@ PACKAGE = ROOT / "jaxhom"
 ROWS = {
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
     "canonical_forms": -1,  # arrays in, keys out
+    "first_order": -1,  # a value in, the same value out
     "padded_rows": -1,  # arrays in, arrays out
     "policy_chain": -0.5,
     "mdp": 0,

@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxhom.lane_queue import solve_many
+from jaxhom.brackets import settle_by_pdhg
 from jaxhom.local_models import isomorphism, local_models, model_rounding
 from jaxhom.mdp import MDP
 from jaxhom.pdhg import Status, engine
@@ -82,32 +82,35 @@ def certified_maps(mdp: MDP, sources, targets, distance: int, anchored: bool) ->
 def _solve(from_models, to_models, pairs: np.ndarray, anchored: bool, result: CertifiedMaps) -> None:
     """Writes the bounds and maps of the given pairs into `result`."""
     n, m = result.maps.shape[1:]
-    source, target = _padded(from_models, pairs), _padded(to_models, pairs)
+    (source, source_labels), (target, target_labels) = _padded(from_models, pairs), _padded(to_models, pairs)
     tolerance = 1e-6 if source.dtype == np.float64 else 1e-4
     per_iteration = 2 * source.shape[1] * len(source) * len(target) * (len(source) + len(target))
-    found = solve_many(
-        engine.SOLVER,
+    found = settle_by_pdhg(
         HomomorphismProblem(
             source=source,
             target=target,
             source_size=from_models.size[pairs],
             target_size=to_models.size[pairs],
             anchored=anchored,
+            source_labels=source_labels,
+            target_labels=target_labels,
         ),
         tolerance=tolerance,
         max_iterations=int(np.clip(_MAX_PRODUCTS / per_iteration, engine.STEPS_PER_CHECK, _MAX_ITERATIONS)),
         lanes=_LANES,
-        keep=("lower", "upper", "best_primal"),
+        keep=("best_primal",),
     )
-    result.lower[pairs], result.upper[pairs] = np.maximum(found["lower"], 0.0), found["upper"]
+    result.lower[pairs], result.upper[pairs] = found["lower"], found["upper"]
     result.maps[pairs] = np.moveaxis(found["best_primal"], -1, 0)[:, :n, :m]
-    is_settled = found["upper"] - found["lower"] <= tolerance
-    result.status[pairs] = np.where(is_settled, Status.SOLVED, Status.ITERATION_LIMIT)
+    result.status[pairs] = found["status"]
 
 
-def _padded(models, pairs: np.ndarray) -> np.ndarray:
-    """[n', A, n', P]: the models of some pairs, lanes last, padded to one of a few sizes."""
+def _padded(models, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """[n', A, n', P] and labels [n', A, L, P] or None: some models, lanes last, padded to one of a few sizes."""
     transition = np.moveaxis(models.transition[pairs], 0, -1)
     size = len(transition)
     room = 2 ** int(np.ceil(np.log2(max(size, _SMALL)))) - size
-    return np.pad(transition, [(0, room), (0, 0), (0, room), (0, 0)])
+    labels = getattr(models, "labels", None)
+    if labels is not None:
+        labels = np.pad(np.moveaxis(labels[pairs], 0, -1), [(0, room), (0, 0), (0, 0), (0, 0)])
+    return np.pad(transition, [(0, room), (0, 0), (0, room), (0, 0)]), labels

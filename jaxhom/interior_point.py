@@ -30,7 +30,7 @@ class InteriorPointState:
     """Iterates and best bounds, lanes last.
 
     Attributes:
-      f: [n, m, lanes]. e: [lanes]. plus, minus: y+ and y-, [n, A, m, lanes]. z: [n, m, lanes].
+      f: [n, m, lanes]. e: [lanes]. plus, minus: y+ and y-, [n, A, m + L, lanes]. z: [n, m, lanes].
       lower, upper: [lanes], best bounds. steps: int32 [lanes]. alive: bool [lanes], False once a step was refused.
     """
 
@@ -145,9 +145,11 @@ def _masks(problem: HomomorphismProblem) -> tuple[jax.Array, jax.Array]:
 
 
 def _constraints(problem: HomomorphismProblem, real: jax.Array) -> jax.Array:
-    """bool [n, A, m, lanes]: the entries of K f that exist."""
+    """bool [n, A, m + L, lanes]: the entries of K f that exist."""
     n, m, lanes = real.shape
-    return jnp.broadcast_to(real[:, None], (n, problem.source.shape[1], m, lanes))
+    is_row = jnp.broadcast_to(real[:, None], (n, problem.source.shape[1], m, lanes))
+    labels = jnp.broadcast_to(real[:, None, :1], (*is_row.shape[:2], problem.num_labels, lanes))  # column 0 is real
+    return jnp.concatenate([is_row, labels], axis=2)
 
 
 def _update_bounds(problem: HomomorphismProblem, state: InteriorPointState) -> InteriorPointState:

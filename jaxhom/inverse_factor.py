@@ -26,6 +26,8 @@ def inverse_factor(matrix: jax.Array, leaf: int | None = None) -> jax.Array:
       W [D, D], lower triangular; NaN where the matrix is not positive definite.
     """
     size = len(matrix)
+    if not size:
+        return matrix
     leaf = leaf or max(_MIN_LEAF, -(-size // 12))
     if size <= leaf:
         return _eliminate(matrix)

@@ -192,12 +192,13 @@ def homomorphism_residual(source, target, mapping):
     return np.max(np.abs(through_source - through_target))
 
 
-def homomorphism_lp(source, target, anchored=True):
+def homomorphism_lp(source, target, anchored=True, labels=None):
     """LP (9) between `source` [n, A, n] and `target` [m, A, m]: (error, map [n, m]).
 
     Minimise e over f >= 0 with sum_k f(i, k) = 1 and, for all i, k, a,
     |sum_j T(i, a, j) f(j, k) - sum_j f(i, j) T'(j, a, k)| <= e.
-    `anchored` requires in addition f(0, 0) = 1: state 0 is the centre of both models.
+    `anchored` requires in addition f(0, 0) = 1: state 0 is the centre of both models. `labels`, [n, A, L] and
+    [m, A, L], add |l(i, a) - sum_k f(i, k) l'(k, a)| <= e for every label.
     The variables are f, row by row, and e.
     """
     n, num_actions, _ = source.shape
@@ -209,14 +210,19 @@ def homomorphism_lp(source, target, anchored=True):
             for a in range(num_actions)
         ]
     )
-    minus_e = -np.ones((n * m * num_actions, 1))
+    constant = np.zeros(n * m * num_actions)
+    if labels is not None:
+        kept = [(labels[0][:, a, i], labels[1][:, a, i]) for a in range(num_actions) for i in range(labels[0].shape[2])]
+        difference = sparse.vstack([difference, *(sparse.kron(identity_n, there[None]) for _, there in kept)])
+        constant = np.concatenate([constant, *(here for here, _ in kept)])
+    minus_e = -np.ones((len(constant), 1))
     bounds = [(0.0, None)] * (n * m + 1)
     if anchored:
         bounds[0] = (1.0, 1.0)
     result = _solve_lp(
         cost=np.append(np.zeros(n * m), 1.0),
         A_ub=sparse.block_array([[difference, minus_e], [-difference, minus_e]]),
-        b_ub=np.zeros(2 * n * m * num_actions),
+        b_ub=np.concatenate([constant, -constant]),
         A_eq=sparse.hstack([sparse.kron(identity_n, np.ones((1, m))), np.zeros((n, 1))]),
         b_eq=np.ones(n),
         bounds=bounds,

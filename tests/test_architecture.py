@@ -18,6 +18,7 @@ ROWS = {
     "status": -1,  # how an answer ended
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
     "canonical_forms": -1,  # arrays in, keys out
+    "first_order": -1,  # a value in, the same value out
     "padded_rows": -1,  # arrays in, arrays out
     "policy_chain": -0.5,
     "mdp": 0,
@@ -41,6 +42,7 @@ ROWS = {
     "interior_point": 1.3,
     "normal_equations": 1.2,
     "sparse_interior_point": 1.3,
+    "host_certificates": 1.4,
     "brackets": 1.6,
     "homomorphism": 2,
     "homomorphism_map": 2,

@@ -19,6 +19,7 @@ supergradient. Second derivatives would need those of x, w and V, and are refuse
 import jax
 import jax.numpy as jnp
 
+from jaxhom.first_order import first_order_only
 from jaxhom.lpal.certificate import LPALSolution
 from jaxhom.mdp import MDP, push_forward
 from jaxhom.planning import optimal_policy
@@ -64,7 +65,8 @@ def _margins(mdp, expectations, margin, margin_bound, saddle):
 @_margins.defjvp
 def _(primals, tangents):
     mdp, expectations, *_, saddle = primals
-    saddle = _only_once(saddle, mdp, expectations)
+    message = "lpal's margin has first derivatives only: the policy and the weights carry none"
+    saddle = first_order_only(saddle, (mdp, expectations), message)
     change = jax.jvp(lambda *inputs: _lagrangian(*inputs, *saddle), primals[:2], tangents[:2])[1]
     return _margins(*primals), (change, change)
 
@@ -75,15 +77,3 @@ def _lagrangian(mdp: MDP, expectations, x, weights, value) -> jax.Array:
     excess = jnp.einsum("bsa,sak->bk", x, mdp.features) - expectations
     arrivals = mdp.initial + mdp.discount * push_forward(mdp, jnp.moveaxis(x, 0, -1)).T
     return (weights * excess).sum(axis=-1) + (value * (arrivals - x.sum(axis=-1))).sum(axis=-1)
-
-
-@jax.custom_jvp
-def _only_once(saddle, mdp, expectations):
-    """The saddle point, which depends on model and expectations in a way that nobody differentiates."""
-    del mdp, expectations
-    return saddle
-
-
-@_only_once.defjvp
-def _(primals, tangents):
-    raise ValueError("lpal's margin has first derivatives only: the policy and the weights carry none")

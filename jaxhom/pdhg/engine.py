@@ -152,6 +152,8 @@ def solve(
 ) -> PDHGState:
     """Steps until the given fraction of the lanes is settled (see `is_settled`) or out of iterations.
 
+    Lanes that are finished stay where they are: an answer does not depend on the lanes beside it.
+
     Args:
       problem: the problem.
       state: from `init` or a former call.
@@ -162,10 +164,14 @@ def solve(
     """
     lanes = state.lower.shape[-1]
 
-    def keep_going(state):
-        return is_finished(state, tolerance, threshold, max_iterations).sum() < jnp.ceil(stop_fraction * lanes)
+    def is_done(state):
+        return is_finished(state, tolerance, threshold, max_iterations)
 
-    return jax.lax.while_loop(keep_going, lambda s: step(problem, s), state)
+    def advance(state):
+        done = is_done(state)
+        return jax.tree.map(lambda old, new: jnp.where(done, old, new), state, step(problem, state))
+
+    return jax.lax.while_loop(lambda s: is_done(s).sum() < jnp.ceil(stop_fraction * lanes), advance, state)
 
 
 def is_settled(state: PDHGState, tolerance, threshold=None) -> jax.Array:
@@ -177,8 +183,9 @@ def is_settled(state: PDHGState, tolerance, threshold=None) -> jax.Array:
 
 
 def is_finished(state: PDHGState, tolerance, threshold, max_iterations) -> jax.Array:
-    """[lanes]: settled, or out of iterations."""
-    return is_settled(state, tolerance, threshold) | (state.steps >= max_iterations)
+    """[lanes]: settled, or out of iterations, or without a step length because the problem is not finite."""
+    is_lost = (state.steps >= max_iterations) | jnp.isnan(state.eta)
+    return is_settled(state, tolerance, threshold) | is_lost
 
 
 SOLVER = Solver(init, step, is_finished)

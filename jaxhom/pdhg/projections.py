@@ -86,12 +86,13 @@ def _threshold(point: jax.Array, total: float, axes: tuple[int, ...]) -> jax.Arr
         return (step < count) & jnp.any(excess > rounding)
 
     def newton(carry):
-        step, threshold, _ = carry
+        step, threshold, change = carry
+        is_open = change > rounding  # a root that is found stays: an answer does not depend on the lanes beside it
         excess = point - jnp.expand_dims(threshold, axes)
         above = (excess > 0).astype(point.dtype)
         number = jnp.maximum(reduce_leading(above, axes), 1.0)
         mass = reduce_leading(jnp.maximum(excess, 0.0), axes)
-        change = (mass - total) / number
+        change = jnp.where(is_open, (mass - total) / number, 0.0)
         return step + 1, threshold + change, change
 
     first = (jnp.zeros((), jnp.int32), start, jnp.full_like(start, jnp.inf))

@@ -322,12 +322,22 @@ def _inverse_cdf(cumulative: jax.Array, uniform: jax.Array) -> jax.Array:
     return jnp.searchsorted(cumulative, target, side="right").astype(jnp.int32)
 
 
+def require_no_steps(name: str, pair) -> None:
+    """Raises where a pair may be two steps (state, action) instead of (states, actions): two tuples of two numbers."""
+    if all(isinstance(part, tuple) and len(part) == 2 and all(np.ndim(entry) == 0 for entry in part) for part in pair):
+        raise ValueError(
+            f"{name} could be (states, actions) or two steps (state, action), got {checks.in_one_line(pair)}: pass "
+            "lists or arrays, ([state, state], [action, action])"
+        )
+
+
 def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:
     """Checks one (states, actions) pair."""
     try:
         states, actions = pair
     except (TypeError, ValueError):
         raise ValueError(f"trajectory {index} must be a pair (states, actions)") from None
+    require_no_steps(f"trajectory {index}", (states, actions))
     states = checks.as_host_array(f"trajectory {index} states", states)
     actions = checks.as_host_array(f"trajectory {index} actions", actions)
     for name, array in (("states", states), ("actions", actions)):

@@ -11,17 +11,20 @@ libraries is imported: what counts is what the objects hold.
 
 import csv
 import dataclasses
+import itertools
 import os
 from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.demonstrations import Demonstrations
+from jaxhom.demonstrations import Demonstrations, require_no_steps
 from jaxhom.interop.files import FileError
 from jaxhom.mdp import MDP
 
 COLUMNS = ("episode", "state", "action")
+STEP_COLUMNS = ("step", "t", "time", "timestep")
 _FIELDS = (("obs", "acts"), ("observations", "actions"))
 _LARGEST_INDEX = 2**31 - 1
 
@@ -68,7 +71,7 @@ def demonstrations_from_episodes(
     Raises:
       ValueError: if there is no episode, something is not an episode, or none can be used (with the first reason).
     """
-    kept, dropped, final = [], [], 0
+    kept, ended, dropped, final = [], [], [], 0
     for position, episode in enumerate(_iterate(episodes)):
         observations, actions = _fields(position, episode)
         try:
@@ -77,8 +80,19 @@ def demonstrations_from_episodes(
             dropped.append((position, str(error)))
             continue
         final += len(states) - len(actions)
-        kept.append((states[: len(actions)], actions))
-    return _finish(kept, dropped, final)
+        kept.append((states, actions))
+        ended.append(_has_terminated(episode))
+    return _finish(kept, dropped, final, ended)
+
+
+def _has_terminated(episode) -> bool:
+    """Whether an episode says that it ended in a terminal state: imitation's `terminal`, or `terminated(s)`."""
+    for name in ("terminal", "terminated", "terminations"):
+        flag = episode.get(name) if isinstance(episode, Mapping) else getattr(episode, name, None)
+        if flag is not None:
+            flags = np.atleast_1d(np.asarray(flag))
+            return bool(flags.size and flags[-1])
+    return False
 
 
 def demonstrations_from_steps(
@@ -116,12 +130,55 @@ def demonstrations_from_steps(
     return demonstrations_from_episodes(zip(*pieces, strict=True), to_states=to_states)
 
 
+def demonstrations_from_transitions(
+    observations, actions, next_observations, dones, *, to_states: Callable | None = None
+) -> tuple[Demonstrations, ImportReport]:
+    """Reads flattened transitions, as `imitation` and offline data sets hold them, and finds the episodes again.
+
+    An episode ends after a step with `done`, where it terminated, and wherever the next observation is not the one of
+    the following step: truncated episodes carry no `done`, and would be joined with what comes after them.
+
+    Args:
+      observations: [T, ...], one per step, in order.
+      actions: [T] or [T, 1].
+      next_observations: [T, ...], what followed each step.
+      dones: bool [T], whether the step ended its episode in a terminal state.
+      to_states: as in `demonstrations_from_episodes`.
+
+    Returns:
+      The demonstrations, with `final_states` and `terminated`, and the report.
+
+    Raises:
+      ValueError: if the arrays differ in length, there is no step, or no episode can be used.
+    """
+    arrays = {"observations": observations, "next_observations": next_observations, "actions": actions, "dones": dones}
+    arrays = {name: checks.as_host_array(name, array) for name, array in arrays.items()}
+    length = len(np.atleast_1d(arrays["observations"]))
+    for name, array in arrays.items():
+        good = array.ndim >= 1 and len(array) == length > 0
+        checks.require_shape(name, array, f"({length}, ...) like observations, T >= 1", good)
+    before, after, actions, dones = arrays.values()
+    joined = (after[:-1] == before[1:]).reshape(length - 1, -1).all(axis=1)
+    ends = np.append(np.flatnonzero(dones[:-1].astype(bool) | ~joined), length - 1)
+    starts = np.append(0, ends[:-1] + 1)
+    episodes = [
+        {
+            "observations": np.concatenate([before[first : last + 1], after[last : last + 1]]),
+            "actions": actions[first : last + 1],
+            "terminated": bool(dones[last]),
+        }
+        for first, last in zip(starts, ends, strict=True)
+    ]
+    return demonstrations_from_episodes(episodes, to_states=to_states)
+
+
 def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) -> tuple[Demonstrations, ImportReport]:
     """Reads a comma-separated file with one step a line.
 
     The first line names the columns. Needed are `episode` (any text), `state` and `action` (whole numbers from 0 on);
-    others are ignored. Lines of one episode stand in the order of its steps; episodes may be interleaved. Blank lines
-    are skipped. An empty action marks the final observation of its episode.
+    others are ignored. Lines of one episode are in the order of their column `step` (or `t`, `time`, `timestep`; whole
+    numbers), or, without one, in the order of the steps as they stand; episodes may be interleaved. Blank lines are
+    skipped. An empty action marks the final observation of its episode.
 
     Args:
       path: the file, in UTF-8.
@@ -135,15 +192,20 @@ def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) 
       FileError: if the file is missing or no text, lacks a column, or has a wrong field (naming line and column).
     """
     limits = (_LARGEST_INDEX,) * 2 if mdp is None else (mdp.num_states, mdp.num_actions)
-    steps: dict[str, list[tuple[int, int | None]]] = {}
+    lines: dict[str, list[_Line]] = {}
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, strict=True)
-            places = _places(path, next(reader, []))
+            header = next(reader, [])
+            places, of_step = _places(path, header), _place_of_step(path, header)
             for row in reader:
                 if row:
+                    _require_fields(path, reader.line_num, row, header)
                     episode, state, action = _step(path, reader.line_num, row, places, limits)
-                    _append(path, reader.line_num, steps.setdefault(episode, []), state, action)
+                    number = None
+                    if of_step is not None:
+                        number = _whole_number(path, reader.line_num, header[of_step], row[of_step], _LARGEST_INDEX)
+                    lines.setdefault(episode, []).append(_Line(reader.line_num, number, state, action))
     except UnicodeDecodeError as error:
         raise FileError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
     except OSError as error:
@@ -151,13 +213,14 @@ def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) 
     except csv.Error as error:
         raise FileError(f"{path} line {reader.line_num}: {error}") from None
     kept, dropped, final = [], [], 0
-    for episode, pairs in steps.items():
-        acted = [pair for pair in pairs if pair[1] is not None]
-        if not acted:
+    for episode, unsorted in lines.items():
+        steps = _in_order(path, unsorted)
+        actions = [step.action for step in steps if step.action is not None]
+        if not actions:
             dropped.append((episode, "it has no actions"))
             continue
-        final += len(pairs) - len(acted)
-        kept.append(tuple(np.array(acted, np.int64).T))
+        final += len(steps) - len(actions)
+        kept.append((np.array([step.state for step in steps]), np.array(actions)))
     try:
         return _finish(kept, dropped, final)
     except ValueError as error:
@@ -180,6 +243,7 @@ def _fields(position: int, episode) -> tuple:
         if all(hasattr(episode, name) for name in names):
             return tuple(getattr(episode, name) for name in names)
     if isinstance(episode, tuple | list) and len(episode) == 2:
+        require_no_steps(f"episode {position}", episode)
         return tuple(episode)
     raise ValueError(
         f"episode {position} must have obs and acts, or observations and actions, or be a pair of them; "
@@ -216,12 +280,12 @@ def _column(name: str, values) -> np.ndarray:
     return array
 
 
-def _finish(kept, dropped, final_observations: int) -> tuple[Demonstrations, ImportReport]:
+def _finish(kept, dropped, final_observations: int, terminated=None) -> tuple[Demonstrations, ImportReport]:
     if not kept:
         if not dropped:
             raise ValueError("there are no episodes")
         raise ValueError(f"none of {len(dropped)} episodes can be used; episode {dropped[0][0]}: {dropped[0][1]}")
-    demonstrations = Demonstrations.from_trajectories(kept)
+    demonstrations = Demonstrations.from_trajectories(kept, terminated=terminated)
     steps = sum(len(actions) for _, actions in kept)
     report = ImportReport(
         episodes=len(kept), steps=steps, final_observations=final_observations, dropped=tuple(dropped)
@@ -272,7 +336,40 @@ def _whole_float(text: str) -> float | None:
     return number if number.is_integer() and "_" not in text else None
 
 
-def _append(path, line: int, steps: list, state: int, action: int | None) -> None:
-    if steps and steps[-1][1] is None:
-        raise FileError(f"{path} line {line}: a step after its episode's final observation (a line without action)")
-    steps.append((state, action))
+class _Line(NamedTuple):
+    """One step of a file."""
+
+    line: int
+    number: int | None
+    state: int
+    action: int | None
+
+
+def _in_order(path, lines: list[_Line]) -> list[_Line]:
+    """The lines of one episode by their step numbers, if they have some."""
+    if lines[0].number is not None:
+        lines = sorted(lines, key=lambda line: line.number)
+        for former, line in itertools.pairwise(lines):
+            if former.number == line.number:
+                numbers = f"lines {former.line} and {line.line}"
+                raise FileError(f"{path} {numbers}: step {line.number} occurs twice in its episode")
+    for former, line in itertools.pairwise(lines):
+        if former.action is None:
+            raise FileError(
+                f"{path} line {line.line}: a step after its episode's final observation (a line without action)"
+            )
+    return lines
+
+
+def _place_of_step(path, header: list[str]) -> int | None:
+    """Where the steps' numbers stand, if there are any."""
+    places = [place for place, name in enumerate(header) if name.strip().lower() in STEP_COLUMNS]
+    if len(places) > 1:
+        names = " and ".join(repr(header[place].strip()) for place in places)
+        raise FileError(f"{path} line 1: columns {names} could both number the steps: keep one")
+    return places[0] if places else None
+
+
+def _require_fields(path, line: int, row: list[str], header: list[str]) -> None:
+    if any(field.strip() for field in row[len(header) :]):
+        raise FileError(f"{path} line {line}: {len(row)} fields, but the first line names {len(header)} columns")

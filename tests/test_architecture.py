@@ -33,6 +33,7 @@ ROWS = {
     "impossible_steps": 0.6,
     "episode_ends": 0.6,
     "demonstrations": 1,
+    "host_graph": 0.6,
     "local_models": 1,
     "lane_queue": 0.5,
     "inverse_factor": 0.5,

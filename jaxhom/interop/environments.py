@@ -92,7 +92,11 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
     else:
         terminal = np.zeros(len(next_state), bool)
         terminal[next_state[terminated]] = True
-        terminal |= ~allowed.any(axis=1)  # states without a row: nothing goes on there
+        ends = ~allowed.any(axis=1)  # states without a row: nothing goes on there
+        starts = np.flatnonzero(ends & (initial > 0))
+        if starts.size:
+            raise ValueError(f"sum of P: probability[{starts[0]}, 0] must be 1, got 0.0: episodes start there")
+        terminal |= ends
         _require_ends(next_state, probability, terminated, terminal, initial)
     reward[terminal] = 0.0
     next_state[terminal] = np.flatnonzero(terminal)[:, None, None]

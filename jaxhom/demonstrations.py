@@ -75,6 +75,7 @@ class Demonstrations:
         if not trajectories:
             raise ValueError("at least one trajectory is needed, got none")
         rows = [_validated_trajectory(i, pair) for i, pair in enumerate(trajectories)]
+        require_no_steps(list(enumerate(trajectories)), "trajectory")
         if terminated is None:
             terminated = np.zeros(len(rows), bool)
         terminated = _require_flags("terminated", checks.as_host_array("terminated", terminated), len(rows))
@@ -322,13 +323,29 @@ def _inverse_cdf(cumulative: jax.Array, uniform: jax.Array) -> jax.Array:
     return jnp.searchsorted(cumulative, target, side="right").astype(jnp.int32)
 
 
-def require_no_steps(name: str, pair) -> None:
-    """Raises where a pair may be two steps (state, action) instead of (states, actions): two tuples of two numbers."""
-    if all(isinstance(part, tuple) and len(part) == 2 and all(np.ndim(entry) == 0 for entry in part) for part in pair):
+def require_no_steps(pairs, kind: str) -> None:
+    """Raises if nothing tells pairs (states, actions) from episodes of two steps (state, action) each.
+
+    That is so where all pairs hold two and two numbers, and are not in the form that is asked for, a tuple of two lists
+    or arrays. A single longer one shows what is meant.
+
+    Args:
+      pairs: what was given, with its position, [(position, pair), ...].
+      kind: what a pair is called in the message.
+    """
+    if pairs and all(_may_be_steps(pair) for _, pair in pairs):
+        position, pair = pairs[0]
         raise ValueError(
-            f"{name} could be (states, actions) or two steps (state, action), got {checks.in_one_line(pair)}: pass "
-            "lists or arrays, ([state, state], [action, action])"
+            f"{kind} {position} could be (states, actions) or two steps (state, action), got "
+            f"{checks.in_one_line(pair)}: pass a tuple of two lists or arrays, ([state, state], [action, action])"
         )
+
+
+def _may_be_steps(pair) -> bool:
+    parts = [part for part in pair if isinstance(part, tuple | list | np.ndarray) and len(part) == 2]
+    if len(parts) < 2 or any(hasattr(entry, "__len__") for part in parts for entry in part):
+        return False
+    return not isinstance(pair, tuple) or all(isinstance(part, tuple) for part in parts)
 
 
 def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:
@@ -337,7 +354,6 @@ def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:
         states, actions = pair
     except (TypeError, ValueError):
         raise ValueError(f"trajectory {index} must be a pair (states, actions)") from None
-    require_no_steps(f"trajectory {index}", (states, actions))
     states = checks.as_host_array(f"trajectory {index} states", states)
     actions = checks.as_host_array(f"trajectory {index} actions", actions)
     for name, array in (("states", states), ("actions", actions)):

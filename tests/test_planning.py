@@ -349,7 +349,7 @@ def test_many_actions_compile_in_seconds(rng):
     mdp = MDP.from_successors(next_state, np.full((40, 200, 2), 0.5), discount=0.9)
     begin = time.perf_counter()
     plan = jax.jit(optimal_policy)(mdp, reward)
-    assert time.perf_counter() - begin < 20  # 5 s on quiet cores; unrolled it took minutes
+    assert time.perf_counter() - begin < 60  # 5 s on quiet cores; unrolled it took minutes
     np.testing.assert_allclose(plan.value, optimal_policy(mdp, reward).value, rtol=1e-8)
 
 

@@ -17,5 +17,5 @@ def _run() -> int:
 
 if __name__ == "__main__":
     sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no reason to stop
-    sys.stdout = interrupts.UntilClosed(sys.stdout)
+    sys.stdout, sys.stderr = map(interrupts.UntilClosed, (sys.stdout, sys.stderr))
     interrupts.leave(_run())

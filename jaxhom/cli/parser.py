@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 
 import jax
@@ -23,7 +24,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
-        options.run(options)
+        with warnings.catch_warnings():  # what a command decides about warnings ends with it
+            options.run(options)
     except OSError as error:
         print(f"jaxhom: error: {_of_file(error)}", file=sys.stderr)
         return 2
@@ -33,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         interrupts.rest()
         print("; ".join(["jaxhom: interrupted", *map(str, interruption.args)]), file=sys.stderr)
-        return 130
+        return interrupts.INTERRUPTED
     return 0
 
 

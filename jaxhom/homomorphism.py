@@ -41,10 +41,8 @@ _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
 _CHUNK_LANES = 32  # of `homomorphism_error` under vmap
 _CHUNK_BYTES = 256 * 2**20
 _MAX_ITERATIONS = 100_000
-_MAX_PRODUCTS, _MIN_ITERATIONS = (
-    2e11,
-    64,
-)  # multiplications per pair: large models stop early, with the bounds they have
+_MAX_PRODUCTS = 2e11  # multiplications per pair: large models stop early, with the bounds they have
+_MIN_ITERATIONS = 64
 _TOO_LARGE = -2
 
 

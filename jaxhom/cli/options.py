@@ -75,8 +75,8 @@ def add_demonstration_options(parser: Parser) -> None:
     group.add_argument(
         "--impossible",
         choices=("refuse", "warn", "ignore"),
-        default="refuse",
-        help="what to do about demonstrated steps that the model gives probability 0 (default refuse)",
+        default="warn",
+        help="what to do about demonstrated steps that the model gives probability 0 (default warn)",
     )
 
 

@@ -30,7 +30,6 @@ learned = jaxhom.soft_local_homomorphism(world, walk)
 print(learned.explain(int(np.argmax(learned.radius))))
 bounds = jaxhom.local_similarity(world, [0, 5, 1], [1, 6, 2])
 assert (bounds.lower <= bounds.upper).all()
-assert jaxhom.soft_homomorphism(world, walk).error_upper >= 0
 
 # Transformations and derivatives.
 values = jax.jit(jax.vmap(lambda reward: jaxhom.optimal_policy(lake.mdp, reward).value))(
@@ -39,10 +38,6 @@ values = jax.jit(jax.vmap(lambda reward: jaxhom.optimal_policy(lake.mdp, reward)
 assert np.isfinite(np.asarray(values)).all()
 gradient = jax.grad(lambda reward: jaxhom.optimal_policy(lake.mdp, reward).value.sum())(lake.reward)
 assert np.isfinite(np.asarray(gradient)).all()
-slope = jax.grad(lambda source: jaxhom.homomorphism_error(source, world.mdp.transition[:2, :, :2] * 0 + 0.5))(
-    np.full((2, 4, 2), [0.75, 0.25])
-)
-assert np.isfinite(np.asarray(slope)).all()
 
 # Files and pictures.
 with tempfile.TemporaryDirectory() as folder:

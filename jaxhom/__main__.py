@@ -11,8 +11,8 @@ def _run() -> int:
 
         interrupts.watch()
         return main()
-    except KeyboardInterrupt:  # as late as in `main`'s own last lines
-        return interrupts.INTERRUPTED
+    except KeyboardInterrupt:  # while options are read, or as late as in the last lines of `main`
+        return interrupts.say()
 
 
 if __name__ == "__main__":

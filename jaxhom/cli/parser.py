@@ -26,16 +26,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():  # what a command decides about warnings ends with it
             options.run(options)
-    except OSError as error:
-        print(f"jaxhom: error: {_of_file(error)}", file=sys.stderr)
+    except (Exception, KeyboardInterrupt) as error:
+        if interrupts.is_interruption(error):
+            return interrupts.say(*error.args * isinstance(error, KeyboardInterrupt))
+        if not isinstance(error, OSError | ValueError | ImportError):
+            raise
+        message = _of_file(error) if isinstance(error, OSError) else str(error).partition("\n")[0]
+        print(f"jaxhom: error: {message}", file=sys.stderr)
         return 2
-    except (ValueError, ImportError) as error:
-        print(f"jaxhom: error: {str(error).partition(chr(10))[0]}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as interruption:
-        interrupts.rest()
-        print("; ".join(["jaxhom: interrupted", *map(str, interruption.args)]), file=sys.stderr)
-        return interrupts.INTERRUPTED
     return 0
 
 

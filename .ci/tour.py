@@ -1,27 +1,46 @@
 """A short way through the library, for the oldest releases of what it depends on: seconds, and no test framework."""
 
+import os
+import tempfile
+
 import jax
 import numpy as np
 
 import jaxhom
-from jaxhom.interop import from_gymnasium
+from jaxhom import interop, plotting
 
 jax.config.update("jax_enable_x64", True)
-lake = from_gymnasium("FrozenLake-v1", discount=0.95, features=np.eye(16))
+
+# An environment, planned for, generalized from demonstrations, and LPAL in each of its ways.
+lake = interop.from_gymnasium("FrozenLake-v1", discount=0.95, features=np.eye(16))
 plan = jaxhom.optimal_policy(lake, lake.reward)
 assert plan.status == jaxhom.Status.SOLVED
 demonstrations = jaxhom.sample_demonstrations(jax.random.key(0), lake, plan, 2, 20, terminal=lake.terminal)
 general = jaxhom.soft_local_homomorphism(lake, demonstrations)
-print(general.explain(int(np.argmax(general.radius))))
+assert jax.tree.map(np.shape, general).policy == (16, 4)
 expectations = jaxhom.feature_expectations(lake, general)
-solution = jaxhom.lpal(lake, expectations, initial_policy=general)
-assert solution.margin <= solution.margin_bound
-bounds = jaxhom.local_similarity(lake, [0, 5], [1, 6])
+for method in ("columns", "interior_point", "flow"):
+    solution = jaxhom.lpal(lake, expectations, initial_policy=general, method=method, tolerance=1e-2)
+    assert solution.margin <= solution.margin_bound
+
+# Maps between local models, with votes that need one.
+world = jaxhom.gridworld(4)
+walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
+learned = jaxhom.soft_local_homomorphism(world, walk)
+print(learned.explain(int(np.argmax(learned.radius))))
+bounds = jaxhom.local_similarity(world, [0, 5, 1], [1, 6, 2])
 assert (bounds.lower <= bounds.upper).all()
+
+# Transformations and derivatives.
 values = jax.jit(jax.vmap(lambda reward: jaxhom.optimal_policy(lake.mdp, reward).value))(
     np.eye(16)[..., None] * np.ones(4)
 )
 assert np.isfinite(np.asarray(values)).all()
 gradient = jax.grad(lambda reward: jaxhom.optimal_policy(lake.mdp, reward).value.sum())(lake.reward)
 assert np.isfinite(np.asarray(gradient)).all()
-assert jax.tree.map(np.shape, general).policy == (16, 4)
+
+# Files and pictures.
+with tempfile.TemporaryDirectory() as folder:
+    interop.save_mdp(os.path.join(folder, "model.npz"), lake.mdp)
+    assert interop.load_mdp(os.path.join(folder, "model.npz")).num_states == 16
+    plotting.plot_policy(world, learned.policy).figure.savefig(os.path.join(folder, "policy.png"))

@@ -11,11 +11,11 @@ def _run() -> int:
 
         interrupts.watch()
         return main()
-    except KeyboardInterrupt:  # as late as in `main`'s own last lines
-        return interrupts.INTERRUPTED
+    except KeyboardInterrupt:  # while options are read, or as late as in the last lines of `main`
+        return interrupts.say()
 
 
 if __name__ == "__main__":
     sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no reason to stop
-    sys.stdout = interrupts.UntilClosed(sys.stdout)
+    sys.stdout, sys.stderr = map(interrupts.UntilClosed, (sys.stdout, sys.stderr))
     interrupts.leave(_run())

@@ -12,6 +12,8 @@ import sys
 
 INTERRUPTED = 130
 _AGAIN = 3.0  # seconds after which an interruption that somebody swallowed is raised again
+_SOON = 0.02
+_happened = False
 
 
 def watch_while_loading() -> None:
@@ -26,8 +28,16 @@ def watch() -> None:
 
     A parent that ignores the signal (`nohup`, a job in the background) has decided that there is nothing to watch.
     """
+    global _happened
+    _happened = False
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        sys.unraisablehook = _unraisable
         signal.signal(signal.SIGINT, _raise_once)
+
+
+def is_interruption(error: BaseException) -> bool:
+    """Whether an exception is Ctrl-C's, or what became of it on its way through compiled programs and callbacks."""
+    return _happened or isinstance(error, KeyboardInterrupt)
 
 
 def rest() -> None:
@@ -36,8 +46,17 @@ def rest() -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
+def say(*details) -> int:
+    """Says in one line of stderr that the process was interrupted; the exit code for it."""
+    rest()
+    print("; ".join(["jaxhom: interrupted", *map(str, details)]), file=sys.stderr)
+    return INTERRUPTED
+
+
 def leave(code: int) -> None:
     """Ends the process; at once if it was interrupted."""
+    if signal.getsignal(signal.SIGINT) is _raise_once:  # everything is done and told
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
@@ -80,6 +99,8 @@ def _leave_at_once(*_) -> None:
 
 
 def _raise_once(*_) -> None:
+    global _happened
+    _happened = True
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "setitimer"):  # not on Windows
         signal.signal(signal.SIGALRM, _raise_again)
@@ -89,3 +110,11 @@ def _raise_once(*_) -> None:
 
 def _raise_again(*_) -> None:
     raise KeyboardInterrupt
+
+
+def _unraisable(unraisable) -> None:
+    """An interruption that came while an object was deleted cannot be raised there: soon again, and not a word."""
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+    elif hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, _SOON, _AGAIN)

@@ -261,16 +261,41 @@ FEATURES = MODEL + "--features states "
             "--mdp plain.npz --demonstrations demos.npz --output out --method nearest-neighbors --metric euclidean",
             "--metric euclidean needs coordinates of the states, and plain.npz has none",
         ),
-        ("--mdp model.npz --demonstrations demos.npz --output demos.csv", "demos.csv: File exists"),
+        (
+            "--mdp model.npz --demonstrations demos.npz --output model.track",
+            "--output model.track: policies are written",
+        ),
+        ("--mdp model.npz --demonstrations demos.npz --output p.csv", "--output p.csv: policies are written to .npz"),
+        ("--mdp model.npz --demonstrations demos.npz --output notes", "notes: File exists"),
         ("--mdp model.npz --demonstrations demos.npz --output no/where.npz", "no: no such folder"),
         (f"--env {LAKE} dry --expert 1 --output out", "--env: expected NAME=VALUE after the id, got 'dry'"),
         ("--env Nothing-v0 --expert 1 --output out", "environment 'Nothing-v0' cannot be made: Environment `Nothing`"),
-        (f"--env {LAKE} wet=1 --expert 1 --output out", f"environment '{LAKE}' cannot be made: TypeError"),
+        (
+            f"--env {LAKE} wet=1 --expert 1 --output out",
+            f"environment '{LAKE}': it has no option 'wet'; it has render_",
+        ),
+        (f"--env {LAKE} is_slippery=nope --expert 1 --output out", "is_slippery must be true or false, got 'nope'"),
+        (
+            f"--env {LAKE} desc=[SF,FG] --expert 1 --output out",
+            "--env: desc is neither JSON nor a Python value, got [SF",
+        ),
+        (f"--env {LAKE} desc=SF desc=FG --expert 1 --output out", "--env: desc is given twice"),
+        (
+            "--env Taxi-v4 fickle_passenger=yes --expert 1 --output out",
+            "fickle_passenger=True, which its table P does n",
+        ),
+        (
+            "--mdp model.npz --demonstrations from1.csv --output out",
+            "from1.csv: 1 of 2 steps have probability 0 in this model; the first is trajectory 0, step 0: "
+            "state 1, action 1, then state 8",
+        ),
         ("--env CartPole-v1 --expert 1 --output out", "CartPole-v1: environment CartPoleEnv has no transition table P"),
     ],
 )
 def test_what_does_not_fit_is_one_line(in_folder, capsys, arguments, message):
     in_folder["a.foo"].write_text("")
+    in_folder["notes"].write_text("")
+    in_folder["from1.csv"].write_text("episode,state,action\na,1,1\na,8,1\na,12,\n")
     in_folder["bad.track"].write_text(TRACK + "S.?F\n")
     interop.save_mdp(in_folder["plain.npz"], in_folder.lake.mdp)
     assert message in error_of(capsys, "learn", *arguments.split())
@@ -311,6 +336,7 @@ POLICY = "policy.npz --mdp model.npz "
         ("evaluate policy.npz --mdp a.track", "policy.npz: its policy is (16, 4), but racetrack a.track has (100, 5)"),
         (f"evaluate {POLICY} --against wrong.npz", "wrong.npz: sum of policy[0] must be 1, got 2"),
         (f"evaluate {POLICY} --trials 1", "--trials must be 0 or at least 2"),
+        (f"evaluate {POLICY} --output policy.npz", "--output policy.npz: the numbers are written to a .json file"),
         ("explain 16 --mdp model.npz --demonstrations demos.npz", "state 16 must lie in [0, 16)"),
         ("explain x --mdp model.npz --demonstrations demos.npz", "state 'x' must be a number, or numbers with commas"),
         ("explain 1,2 --mdp model.npz --demonstrations demos.npz", "model.npz numbers its states from 0 to 15"),

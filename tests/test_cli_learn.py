@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 
 import numpy as np
 import oracles
@@ -206,7 +207,21 @@ def test_options_of_environments_reach_them(files, monkeypatch):
 
 @pytest.mark.parametrize(
     ("word", "value"),
-    [("a=false", False), ("a=True", True), ("a=None", None), ("a=8x8", "8x8"), ("a=0.5", 0.5), ('a=["SG"]', ["SG"])],
+    [
+        ("a=false", False),
+        ("a=True", True),
+        ("a=no", False),
+        ("a=Yes", True),
+        ("a=off", False),
+        ("a=ON", True),
+        ("a=None", None),
+        ("a=8x8", "8x8"),
+        ("a=0.5", 0.5),
+        ("a=1", 1),
+        ('a=["SG"]', ["SG"]),
+        ("a=(1, 0.5)", (1, 0.5)),
+        ("a=('SG', 'FF')", ("SG", "FF")),
+    ],
 )
 def test_values_of_options_are_json_or_text(word, value):
     assert environment_options([word]) == {"a": value}
@@ -220,6 +235,22 @@ def test_csv_and_npz_are_the_same_demonstrations(files):
     one, other = (files.arrays(f"{kind}/demonstrations.npz") for kind in ("csv", "npz"))
     for name in ("states", "actions", "length"):
         np.testing.assert_array_equal(one[name], other[name])
+
+
+@pytest.mark.parametrize(("choice", "lines"), [("warn", 1), ("ignore", 0)])
+def test_impossible_demonstrations_are_let_pass_where_that_was_asked_for(files, capsys, choice, lines):
+    files["demos.csv"].write_text("episode,state,action\na,1,1\na,8,1\na,12,\n")
+    arguments = ["--mdp", files.path("model.npz"), "--demonstrations", files.path("demos.csv"), "--impossible", choice]
+    method = ["--method", "maximum-entropy", "--no-pictures"]
+    with warnings.catch_warnings(record=True) as others:
+        warnings.simplefilter("always")
+        assert main(["learn", *arguments, *method, "--output", files.path("out")]) == 0
+        assert main(["explain", "0", *arguments, *method[:2]]) == 0
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 2 * lines and not others
+    assert all("demos.csv: 1 of 2 steps have probability 0" in line for line in error)
+    assert files.report()["options"]["impossible"] == choice
+    assert main(["plot", "trajectories", files.path("demos.csv"), *arguments[:2], "--output", files.path("t.png")]) == 0
 
 
 def test_a_discount_for_a_file_without_one(files):

@@ -61,6 +61,25 @@ def test_scipy_rows_are_pairs_actions_of_a_state_together(name, kind):
     np.testing.assert_array_equal(mdp.features, case.features)
 
 
+@pytest.mark.parametrize("rest", [0.0, np.nan, 7.0])
+def test_rows_of_actions_that_do_not_exist_are_not_looked_at(rest):
+    """Dense, sparse and pair by pair: what stands in such rows is nobody's business, and they end up empty."""
+    case = small_models.case("sparse")
+    allowed = np.ones(case.transition.shape[:2], bool)
+    allowed[1, 0] = allowed[4, 1:] = False
+    given = np.where(allowed[..., None], case.transition, rest)
+    pairs = scipy.sparse.csr_array(given.reshape(-1, len(given)))
+    layouts = {name: TOOLBOX[name](given) for name in ("array", "csr", "mixed")}
+    options = {"discount": 0.9, "features": case.features, "allowed": allowed}
+    for mdp in (*(from_mdptoolbox(layout, **options) for layout in layouts.values()), from_scipy(pairs, **options)):
+        np.testing.assert_array_equal(mdp.allowed, allowed)
+        np.testing.assert_allclose(dense_transition(mdp), np.where(allowed[..., None], case.transition, 0), atol=1e-15)
+    for wrong, message in ((allowed.T, "allowed must have shape"), (allowed * 1.0, "allowed must be bool")):
+        for build, transitions in ((from_mdptoolbox, layouts["array"]), (from_scipy, pairs)):
+            with pytest.raises(ValueError, match=message):
+                build(transitions, discount=0.9, allowed=wrong)
+
+
 def test_duplicates_add_up_zeros_vanish_and_the_matrix_is_left_alone():
     entries = np.array([0.25, 0.25, 0.5, 0.0, 1.0], np.float32)
     matrix = scipy.sparse.csr_array((entries, [1, 1, 0, 2, 2], [0, 4, 5, 5]), shape=(3, 3)).tocsr()

@@ -1,80 +1,120 @@
 """Ctrl-C at any moment gives one line and exit code 130; a reader who has seen enough is no error.
 
-`JAXHOM_INTERRUPTS=100 python -m pytest -n 0 tests/test_interrupts.py` tries as many moments as that.
+A handful of moments here; `interrupt_often` tries as many as one likes.
 """
 
 import os
-import pathlib
-import random
 import signal
 import subprocess
 import sys
 import time
 
+import interrupt_often
 import pytest
+from cli_cases import Files
 
 from jaxhom import interrupts
+from jaxhom.cli import main, parser
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
-MAIN_JOB = ["--grid", "6", "--regions", "4", "--demonstrations", "2", "--sets", "2"]
-LEARN = ["learn", "--env", "FrozenLake-v1", "--expert", "2", "--no-pictures"]
-MOMENTS = random.Random(0).choices(range(300, 9000), k=int(os.environ.get("JAXHOM_INTERRUPTS", 4)))  # milliseconds
+LEARN = ["learn", "--env", "FrozenLake-v1", "--expert", "2", "--method", "maximum-entropy"]
 
 
-def start(arguments, **options):
-    """The command line, watching for Ctrl-C even where the tests themselves run in the background."""
-    command = [sys.executable, "-m", "jaxhom", *arguments]
-    restore = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": environment}
-    return subprocess.Popen(command, **pipes, preexec_fn=restore, **options)
-
-
-@pytest.mark.parametrize("number", range(len(MOMENTS)))
-def test_an_interruption_is_one_line(number, tmp_path):
-    arguments = [*LEARN, "--output", str(tmp_path / "out")] if number % 2 else MAIN_JOB
-    process = start(arguments, cwd=tmp_path)
-    time.sleep(MOMENTS[number] / 1000)
-    process.send_signal(signal.SIGINT)
-    process.send_signal(signal.SIGINT)  # an impatient second one changes nothing
-    _, error = process.communicate(timeout=120)
-    if process.returncode:
-        assert process.returncode == interrupts.INTERRUPTED
-        assert error.decode().startswith("jaxhom: interrupted") and error.count(b"\n") == 1
-    assert not list(tmp_path.rglob("*.partial"))
+@pytest.mark.parametrize(
+    ("job", "seconds"), [("main job", 0.5), ("main job", 5.0), ("learn", 1.5), ("learn, slow LPAL", 7.0)]
+)
+def test_an_interruption_is_one_line(job, seconds, tmp_path):
+    result = interrupt_often.interrupt(interrupt_often.JOBS[job], seconds, tmp_path)
+    assert result in ("interrupted", "done before")
 
 
 def test_a_reader_who_leaves_loses_nothing(tmp_path):
-    with start([*LEARN, "--output", str(tmp_path / "out")]) as process:
+    """`learn | head`, and `learn 2>&1 | head` with a progress bar: on a name that a C locale cannot show."""
+    locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    folder = os.fsencode(tmp_path) + "/p\N{LATIN SMALL LETTER O WITH DIAERESIS}l".encode()
+    with interrupt_often.start([*LEARN, "--progress", "--output", os.fsdecode(folder)], env=locale) as process:
         process.stdout.close()
-        error = process.stderr.read()
-    assert process.returncode == 0 and error == b""
-    assert (tmp_path / "out" / "policy.npz").exists() and (tmp_path / "out" / "report.json").exists()
+        process.stderr.close()
+    assert process.returncode == 0
+    names = sorted(os.fsdecode(name) for name in os.listdir(folder))
+    pictures = ["generalization.png", "occupancy.png", "policy.png", "trajectories.png"]
+    assert names == sorted([*pictures, "demonstrations.npz", "policy.npz", "report.json"])
 
 
-def test_a_name_that_the_terminal_cannot_show(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    target = os.fsencode(tmp_path) + "/p\N{LATIN SMALL LETTER O WITH DIAERESIS}l.npz".encode()
-    command = [sys.executable, "-m", "jaxhom", *LEARN, "--output", target]
-    done = subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr.decode(errors="replace")
-    assert os.path.exists(target)
+def test_a_name_that_the_terminal_cannot_show_is_shown_as_far_as_it_goes(tmp_path):
+    files = Files(tmp_path)
+    arguments = ["plot", "trajectories", files.path("demos.csv"), "--mdp", files.path("model.npz"), "--output"]
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    target = os.fsencode(tmp_path) + b"/p\xc3\xb6l.png"
+    command = [sys.executable, "-m", "jaxhom", *arguments, target]
+    done = subprocess.run(command, env=environment, cwd=interrupt_often.ROOT, capture_output=True, check=False)
+    assert done.returncode == 0 and done.stderr == b""
+    assert os.path.exists(target) and rb"p\udcc3\udcb6l.png" in done.stdout
 
 
-def test_what_somebody_swallows_is_raised_again(monkeypatch):
+@pytest.fixture
+def watched(monkeypatch):
+    """`interrupts` at work in this process, where it leaves nothing behind."""
     monkeypatch.setattr(interrupts, "_AGAIN", 0.05)
+    monkeypatch.setattr(interrupts, "_happened", False)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGALRM)]
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        interrupts.watch()
-        with pytest.raises(KeyboardInterrupt):
+    interrupts.watch()
+    yield
+    interrupts.rest()
+    for number, handler in zip((signal.SIGINT, signal.SIGALRM), handlers, strict=True):
+        signal.signal(number, handler)
+
+
+def test_what_somebody_swallows_is_raised_again(watched):
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1)
+    with pytest.raises(KeyboardInterrupt):
+        time.sleep(1)
+    interrupts.rest()
+    time.sleep(0.2)
+
+
+def test_what_is_swallowed_with_an_object_is_raised_soon_and_says_nothing(watched, monkeypatch, capsys):
+    monkeypatch.setattr(interrupts, "_AGAIN", 60.0)
+
+    class Slow:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+
+    with pytest.raises(KeyboardInterrupt):
+        Slow()
+        time.sleep(5)
+    assert capsys.readouterr().err == ""
+
+
+def test_what_an_interruption_turns_into_is_one(watched, monkeypatch, capsys):
+    """Compiled programs and callbacks raise errors of their own for it."""
+
+    def run(_):
+        try:
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
-        with pytest.raises(KeyboardInterrupt):
-            time.sleep(1)
-        interrupts.rest()
-        time.sleep(0.2)
-    finally:
-        interrupts.rest()
-        for number, handler in zip((signal.SIGINT, signal.SIGALRM), handlers, strict=True):
-            signal.signal(number, handler)
+        except KeyboardInterrupt:
+            raise RuntimeError("INTERNAL: callback failed\nTraceback") from None
+
+    monkeypatch.setattr(parser.main_job, "run", run)
+    assert main([]) == 130
+    assert capsys.readouterr().err == "jaxhom: interrupted\n"
+
+
+def test_an_error_of_ours_is_none(monkeypatch):
+    def run(_):
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(parser.main_job, "run", run)
+    with pytest.raises(RuntimeError, match="a defect"):
+        main([])
+
+
+def test_a_parent_that_ignores_the_signal_is_obeyed(watched):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    interrupts.watch()
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

@@ -50,6 +50,8 @@ def run(options) -> None:
     """
     if options.trials == 1:
         raise ValueError("--trials must be 0 or at least 2: one trial has no standard error")
+    if options.output and not options.output.lower().endswith(".json"):
+        raise ValueError(f"--output {options.output}: the numbers are written to a .json file")
     problem = load_problem(options)
     saved = {path: load_policy_of(problem, path) for path in options.policies}
     others = {options.against: load_policy_of(problem, options.against)} if options.against else {}

@@ -84,7 +84,9 @@ def run(options) -> None:
     output = Results(options.output)
     try:
         _learn(problem, demonstrations, origin, options, output)
-    except KeyboardInterrupt:
+    except (Exception, KeyboardInterrupt) as error:
+        if not interrupts.is_interruption(error):
+            raise
         interrupts.rest()
         raise KeyboardInterrupt("written so far: " + (", ".join(output.written) or "nothing")) from None
     print("\nWritten: " + ", ".join(output.written))

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 
 import jax
@@ -23,17 +24,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
-        options.run(options)
-    except OSError as error:
-        print(f"jaxhom: error: {_of_file(error)}", file=sys.stderr)
+        with warnings.catch_warnings():  # what a command decides about warnings ends with it
+            options.run(options)
+    except (Exception, KeyboardInterrupt) as error:
+        if interrupts.is_interruption(error):
+            return interrupts.say(*error.args * isinstance(error, KeyboardInterrupt))
+        if not isinstance(error, OSError | ValueError | ImportError):
+            raise
+        message = _of_file(error) if isinstance(error, OSError) else str(error).partition("\n")[0]
+        print(f"jaxhom: error: {message}", file=sys.stderr)
         return 2
-    except (ValueError, ImportError) as error:
-        print(f"jaxhom: error: {str(error).partition(chr(10))[0]}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as interruption:
-        interrupts.rest()
-        print("; ".join(["jaxhom: interrupted", *map(str, interruption.args)]), file=sys.stderr)
-        return 130
     return 0
 
 

@@ -60,7 +60,7 @@ def run(options) -> None:
 def _figure(problem: Problem, options):
     path = options.file
     if options.kind == "trajectories":
-        return pictures.draw_trajectories(problem, load_demonstrations_of(problem, path)[0])
+        return pictures.draw_trajectories(problem, load_demonstrations_of(problem, path, "warn")[0])
     policy = load_policy_of(problem, path)
     if options.kind == "occupancy":
         return pictures.draw_occupancy(problem, policy)

@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Callable
 
-from jaxhom.interop.files import save_demonstrations, save_policy
+from jaxhom.interop.files import save_demonstrations, save_policy, whole_file
 
 _FILES = (".csv", ".json", ".npy", ".txt", ".png", ".svg", ".pdf", ".pkl", ".mat", ".h5", ".track", ".zip")
 
@@ -75,8 +75,10 @@ def save_figure(path: str, figure) -> None:
     """
     import matplotlib.pyplot as plt
 
+    kind = os.path.splitext(path)[1].removeprefix(".").lower()
     try:
-        figure.savefig(path, dpi=120)
+        with whole_file(path) as file:
+            figure.savefig(file, dpi=120, format=kind or None)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     finally:
@@ -84,12 +86,10 @@ def save_figure(path: str, figure) -> None:
 
 
 def write_json(path: str, content) -> None:
-    """Writes JSON, beside `path` first; NaN and infinity, which JSON has no word for, as null."""
-    partial = f"{path}.partial"
-    with open(partial, "w", encoding="utf-8") as file:
-        json.dump(_finite(content), file, indent=2, allow_nan=False)
-        file.write("\n")
-    os.replace(partial, path)
+    """Writes JSON; NaN and infinity, which JSON has no word for, as null."""
+    text = json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
+    with whole_file(path) as file:
+        file.write(text.encode())
 
 
 def _finite(value):

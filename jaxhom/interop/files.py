@@ -172,17 +172,29 @@ def _fields(value, *names: str) -> dict[str, np.ndarray]:
     return {name: np.asarray(getattr(value, name)) for name in names}
 
 
-def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
-    """Writes to a file beside `path` first, so that an interrupted write leaves no half of a file there."""
+@contextlib.contextmanager
+def whole_file(path: str | os.PathLike):
+    """A file to write bytes to that is `path` once all is written: an interrupted write leaves no half of it there.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
     partial = f"{os.fspath(path)}.partial"
     try:
         with open(partial, "wb") as file:
-            np.savez_compressed(file, format_version=FORMAT_VERSION, **arrays)
+            yield file
         os.replace(partial, path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             os.remove(partial)
+        if isinstance(error, OSError) and error.filename == partial:
+            error.filename = os.fspath(path)
         raise
+
+
+def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
+    with whole_file(path) as file:
+        np.savez_compressed(file, format_version=FORMAT_VERSION, **arrays)
 
 
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:

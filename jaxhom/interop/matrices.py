@@ -17,7 +17,7 @@ from jaxhom import checks
 from jaxhom.mdp import MDP
 
 
-def from_mdptoolbox(transitions, *, discount, initial=None, features=None) -> MDP:
+def from_mdptoolbox(transitions, *, discount, initial=None, features=None, allowed=None) -> MDP:
     """Builds a model from transitions in the layout of the MDP toolboxes.
 
     Args:
@@ -26,6 +26,7 @@ def from_mdptoolbox(transitions, *, discount, initial=None, features=None) -> MD
       discount: scalar, strictly between 0 and 1.
       initial: [S] distribution of the first state; uniform if None.
       features: [S, A, K] or [S, K]; no features (K = 0) if None.
+      allowed: bool [S, A], the actions that exist; rows of the others are not looked at. All if None.
 
     Returns:
       The model, in the dtype of `transitions`.
@@ -41,29 +42,44 @@ def from_mdptoolbox(transitions, *, discount, initial=None, features=None) -> MD
     is_object_array = isinstance(transitions, np.ndarray) and transitions.dtype.hasobject and transitions.ndim == 1
     is_sequence = isinstance(transitions, list | tuple) or is_object_array
     if is_sequence and any(scipy.sparse.issparse(matrix) for matrix in transitions):
-        return _from_sparse(list(transitions), discount, initial, features)
+        return _from_sparse(list(transitions), discount, initial, features, allowed)
     if is_sequence:
         transitions = list(transitions)
     transitions = checks.as_host_array("transitions", transitions)
     good = transitions.ndim == 3 and transitions.shape[1] == transitions.shape[2] and min(transitions.shape) > 0
     checks.require_shape("transitions", transitions, "[A, S, S] with A, S >= 1", good)
-    transitions = checks.require_distribution("transitions", transitions)
-    return MDP.from_dense(np.moveaxis(transitions, 0, 1), discount=discount, initial=initial, features=features)
+    rows = None if allowed is None else _flags(allowed, transitions.shape[1], len(transitions))
+    transitions = checks.require_distribution("transitions", transitions, None if rows is None else rows.T)
+    options = {"initial": initial, "features": features, "allowed": rows}
+    return MDP.from_dense(np.moveaxis(transitions, 0, 1), discount=discount, **options)
 
 
-def _from_sparse(matrices: list, discount, initial, features) -> MDP:
+def _flags(allowed, num_states: int, num_actions: int) -> np.ndarray:
+    """Which actions exist, bool [S, A], or raises."""
+    allowed = checks.as_host_array("allowed", allowed)
+    checks.require_shape(
+        "allowed", allowed, f"({num_states}, {num_actions})", allowed.shape == (num_states, num_actions)
+    )
+    if allowed.dtype != bool:
+        raise ValueError(f"allowed must be bool, got dtype {allowed.dtype}")
+    return allowed
+
+
+def _from_sparse(matrices: list, discount, initial, features, allowed) -> MDP:
     num_states, num_actions = max(np.shape(matrices[0]), default=0), len(matrices)
     for a, matrix in enumerate(matrices):
         expected = f"({num_states}, {num_states}) with at least one state"
         good = np.shape(matrix) == (num_states, num_states) and num_states > 0
         checks.require_shape(f"transitions[{a}]", matrix, expected, good)
     stacked = scipy.sparse.vstack([scipy.sparse.csr_array(matrix) for matrix in matrices], format="csr")
-    rows = _checked_rows(stacked, lambda row: f"transitions[{row // num_states}] row {row % num_states}")
+    allowed = None if allowed is None else _flags(allowed, num_states, num_actions)
+    exists = np.ones(len(matrices) * num_states, bool) if allowed is None else allowed.T.ravel()
+    rows = _checked_rows(stacked, exists, lambda row: f"transitions[{row // num_states}] row {row % num_states}")
     order = np.arange(num_actions * num_states).reshape(num_actions, num_states).T.ravel()
-    return _from_rows(rows[order], num_actions, discount, initial, features)
+    return _from_rows(rows[order], num_actions, discount, initial, features, allowed)
 
 
-def from_scipy(matrix, *, discount, initial=None, features=None) -> MDP:
+def from_scipy(matrix, *, discount, initial=None, features=None, allowed=None) -> MDP:
     """Builds a model from one sparse matrix with a row per state-action pair.
 
     Args:
@@ -72,6 +88,7 @@ def from_scipy(matrix, *, discount, initial=None, features=None) -> MDP:
       discount: scalar, strictly between 0 and 1.
       initial: [S] distribution of the first state; uniform if None.
       features: [S, A, K] or [S, K]; no features (K = 0) if None.
+      allowed: bool [S, A], the actions that exist; rows of the others are not looked at. All if None.
 
     Returns:
       The model, in the dtype of `matrix`.
@@ -89,16 +106,19 @@ def from_scipy(matrix, *, discount, initial=None, features=None) -> MDP:
     def row_name(row):
         return f"matrix row {row} (state {row // num_actions}, action {row % num_actions})"
 
-    rows = _checked_rows(scipy.sparse.csr_array(matrix), row_name)
-    return _from_rows(rows, num_actions, discount, initial, features)
+    allowed = None if allowed is None else _flags(allowed, matrix.shape[1], num_actions)
+    exists = np.ones(matrix.shape[0], bool) if allowed is None else allowed.ravel()
+    rows = _checked_rows(scipy.sparse.csr_array(matrix), exists, row_name)
+    return _from_rows(rows, num_actions, discount, initial, features, allowed)
 
 
-def _checked_rows(matrix, row_name: Callable[[int], str]):
-    """A copy with duplicates added up and no zeros, or a `ValueError` if a row is no distribution."""
+def _checked_rows(matrix, exists: np.ndarray, row_name: Callable[[int], str]):
+    """A copy with duplicates added up and no zeros, or a `ValueError` if a row that exists is no distribution."""
     if matrix.dtype.kind not in "iubf":
         raise ValueError(f"{row_name(0).split()[0]} must hold real numbers, got dtype {matrix.dtype}")
     keeps_type = matrix.dtype.kind == "f" and matrix.dtype.itemsize <= 8
     matrix = matrix.astype(matrix.dtype if keeps_type else np.float64, copy=True)
+    matrix.data[~np.repeat(exists, np.diff(matrix.indptr))] = 0
     matrix.sum_duplicates()
     matrix.eliminate_zeros()
     for bad, message in ((~np.isfinite(matrix.data), "be finite"), (matrix.data < 0, "not be negative")):
@@ -108,17 +128,17 @@ def _checked_rows(matrix, row_name: Callable[[int], str]):
             column = matrix.indices[entry]
             raise ValueError(f"{row_name(row)}, column {column} must {message}, got {matrix.data[entry]}")
     total = np.asarray(matrix.sum(axis=1, dtype=np.float64))
-    wrong = np.flatnonzero(~checks.sums_to_one(total, matrix.dtype))
+    wrong = np.flatnonzero(exists & ~checks.sums_to_one(total, matrix.dtype))
     if wrong.size:
         raise ValueError(f"{row_name(int(wrong[0]))} must sum to 1, got {total[wrong[0]]}")
     return matrix
 
 
-def _from_rows(rows, num_actions: int, discount, initial, features) -> MDP:
+def _from_rows(rows, num_actions: int, discount, initial, features, allowed) -> MDP:
     """A model from a CSR array with rows s * A + a."""
     num_states = rows.shape[1]
     lengths = np.diff(rows.indptr)
-    width = int(lengths.max())
+    width = max(1, int(lengths.max()))
     checks.require_slots(num_states, num_actions, width)
     pair = np.repeat(np.arange(len(lengths)), lengths)
     slot = np.arange(rows.nnz) - np.repeat(rows.indptr[:-1], lengths)
@@ -132,4 +152,5 @@ def _from_rows(rows, num_actions: int, discount, initial, features) -> MDP:
         discount=discount,
         initial=initial,
         features=features,
+        allowed=allowed,
     )

@@ -7,6 +7,10 @@ feature expectations come from linear solves, and LPAL turns them into a policy 
 Importing the library changes no JAX setting. For float64, set `jax_enable_x64` before making models.
 """
 
+from jaxhom import interrupts
+
+interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
+
 from jaxhom.brackets import LocalSimilarity
 from jaxhom.demonstrations import (
     Demonstrations,
@@ -30,12 +34,13 @@ from jaxhom.homomorphism import (
     locally_similar,
 )
 from jaxhom.homomorphism_map import homomorphism_map
+from jaxhom.impossible_steps import ImpossibleStepsWarning
 from jaxhom.lpal import LPALSolution, lpal
 from jaxhom.mdp import MDP
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
 from jaxhom.occupancy_regression import occupancy_regression
-from jaxhom.pdhg import Status
 from jaxhom.planning import Plan, optimal_policy
+from jaxhom.status import Status
 
 __version__ = "0.1.0"
 
@@ -46,6 +51,7 @@ __all__ = [
     "Explanation",
     "Generalization",
     "Gridworld",
+    "ImpossibleStepsWarning",
     "LPALSolution",
     "LocalSimilarity",
     "Plan",

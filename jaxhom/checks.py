@@ -43,13 +43,13 @@ def require_shape(name: str, array, expected: str, condition: bool) -> None:
         raise ValueError(f"{name} must have shape {expected}, got {tuple(np.shape(array))}")
 
 
-def require_all(name: str, array: np.ndarray, good: np.ndarray, message: str) -> None:
-    """Raises with the first index where `good` (same leading axes as `array`) is false."""
+def require_all(name: str, array: np.ndarray, good: np.ndarray, message: str, remark: str = "") -> None:
+    """Raises with the first index where `good` (same leading axes as `array`) is false; `remark` ends the message."""
     if not np.all(good):
         index = tuple(int(i) for i in np.argwhere(~good)[0])
         value = array[index]
         where = list(index) if index else ""  # a scalar has no index to name
-        raise ValueError(f"{name}{where} {message}, got {value}")
+        raise ValueError(f"{name}{where} {message}, got {value}{remark}")
 
 
 def require_floats(name: str, array: np.ndarray) -> np.ndarray:
@@ -84,19 +84,45 @@ def require_integers(name: str, array: np.ndarray, upper: int | None = None) -> 
     return array.astype(np.int64)
 
 
-def require_distribution(name: str, array: np.ndarray) -> np.ndarray:
-    """Returns `array` as floats whose last axis is a probability distribution, to the dtype's rounding."""
+def require_distribution(name: str, array: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    """Returns `array` as floats whose last axis sums to 1; what people have is brought there.
+
+    Tables with six decimals (1/3, 1/6, 1/7) or once kept in float32 miss 1 in the last digits. Sums within
+    `row_tolerance` of 1 are accepted, and those rows divided by their sum.
+
+    Args:
+      name: what to call it in messages.
+      array: [..., N].
+      rows: bool [...], the rows that have to be distributions; the others come back as zeros. All if None.
+
+    Raises:
+      ValueError: naming the first entry that is not finite or negative, or the first row whose sum is not 1.
+    """
+    if rows is not None:
+        array = np.where(rows[..., None], array, 0)
     array = require_floats(name, array)
     require_all(name, array, array >= 0, "must not be negative")
     with np.errstate(over="ignore"):
         total = array.sum(axis=-1, dtype=np.float64)
-    require_all(f"sum of {name}", total, sums_to_one(total, array.dtype), "must be 1")
+    if rows is not None:
+        total = np.where(rows, total, 1.0)
+    remark = f" (what is within {row_tolerance(array.dtype):.0e} of 1 is brought to 1)"
+    require_all(f"sum of {name}", total, sums_to_one(total, array.dtype), "must be 1", remark)
+    is_off = np.abs(total - 1.0) > 8.0 * np.finfo(array.dtype).eps  # others stay as they are, to the bit
+    if is_off.any():
+        array = np.array(array)
+        array[is_off] = array[is_off] / total[is_off][..., None]
     return array
 
 
 def sums_to_one(total: np.ndarray, dtype) -> np.ndarray:
-    """Whether totals of rows of the given type are 1, to its rounding."""
-    return np.abs(total - 1.0) <= (1e-6 if dtype == np.float64 else 1e-4)
+    """Whether totals of rows of the given type are 1, up to `row_tolerance`."""
+    return np.abs(total - 1.0) <= row_tolerance(dtype)
+
+
+def row_tolerance(dtype) -> float:
+    """By how much a row of probabilities may miss the sum 1: 1e-5 in float64, 1e-4 in shorter types."""
+    return 1e-5 if dtype == np.float64 else 1e-4
 
 
 def require_discount(discount, dtype=np.float64) -> np.ndarray:

@@ -25,7 +25,8 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.demonstrations import sample_demonstrations
-from jaxhom.mdp import MDP, check_policy_shape, push_forward
+from jaxhom.inputs import as_model, check_policy, check_reward, require_policy_shape
+from jaxhom.mdp import MDP, push_forward
 
 
 @chex.dataclass(frozen=True)
@@ -93,6 +94,7 @@ def evaluate_exactly(
       >>> float(evaluate_exactly(mdp, optimal_policy(mdp, reward).policy, reward, 10).total_reward)
       10.0
     """
+    mdp = as_model(mdp)
     policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
     return _evaluate_visits(
         mdp,
@@ -147,6 +149,7 @@ def evaluate_by_sampling(
 
     Source: Boularias and Chaib-draa 2010, section VI; they report no errors.
     """
+    mdp = as_model(mdp)
     policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
     horizon = _require_count("horizon", horizon, 1)
     num_trials = _require_count("num_trials", num_trials, 2)
@@ -182,9 +185,9 @@ def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: ja
     Raises:
       ValueError: if a shape does not fit, or a weight is negative or not finite.
     """
-    policy, expert_policy = jnp.asarray(policy), jnp.asarray(expert_policy)
-    check_policy_shape(mdp, policy)
-    check_policy_shape(mdp, expert_policy, "expert_policy")
+    mdp = as_model(mdp)
+    policy = require_policy_shape(mdp, policy)
+    expert_policy = require_policy_shape(mdp, expert_policy, "expert_policy")
     weights = jnp.ones(mdp.num_states, mdp.dtype) if weights is None else jnp.asarray(weights)
     good = weights.ndim in (1, 2) and weights.shape[-1] == mdp.num_states
     checks.require_shape("weights", weights, f"({mdp.num_states},) or (B, {mdp.num_states})", good)
@@ -194,6 +197,7 @@ def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: ja
     batches = {len(a) for a, n in ((policy, 3), (expert_policy, 3), (weights, 2)) if a.ndim == n}
     if len(batches) > 1:
         raise ValueError(f"batches must be of one size, got {sorted(batches)}")
+    policy, expert_policy = check_policy(mdp, policy), check_policy(mdp, expert_policy, "expert_policy")
     shared = jnp.minimum(policy, expert_policy).sum(axis=-1)
     return (weights * shared).sum(axis=-1) / weights.sum(axis=-1)
 
@@ -275,12 +279,9 @@ def _batch_last(array: jax.Array) -> jax.Array:
 
 def _validated(mdp: MDP, policy, reward, terminal, events):
     """Returns policy, reward, terminal [S] and events in the model's dtype, or raises."""
-    policy, reward = jnp.asarray(policy, mdp.dtype), jnp.asarray(reward, mdp.dtype)
-    check_policy_shape(mdp, policy)
+    policy = require_policy_shape(mdp, policy)
+    reward = check_reward(mdp, reward, policy.shape)
     pair = (mdp.num_states, mdp.num_actions)
-    good = reward.shape in (pair, policy.shape)
-    expected = " or ".join(map(str, dict.fromkeys((pair, policy.shape))))
-    checks.require_shape("reward", reward, expected, good)
     terminal = jnp.zeros(pair[:1], bool) if terminal is None else jnp.asarray(terminal)
     checks.require_shape("terminal", terminal, str(pair[:1]), terminal.shape == pair[:1])
     if terminal.dtype != bool:
@@ -288,7 +289,7 @@ def _validated(mdp: MDP, policy, reward, terminal, events):
     events = {name: jnp.asarray(event, mdp.dtype) for name, event in (events or {}).items()}
     for name, event in events.items():
         checks.require_shape(f"events[{name!r}]", event, str(pair), event.shape == pair)
-    return policy, reward, terminal, events
+    return check_policy(mdp, policy), reward, terminal, events
 
 
 def _require_count(name: str, count, least: int) -> int:

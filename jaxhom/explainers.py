@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from jaxhom import evidence
 from jaxhom.certified_maps import certified_maps
 from jaxhom.explanation import Explanation
 from jaxhom.homomorphism import ClassSimilarity
@@ -43,16 +44,18 @@ class ByHomomorphism:
         steps = steps_from(self.mdp, state)
         radius = int(general.radius[state])
         if radius < 0:
-            return _uniform(general, state, self._method(), _met(general, steps, ", none locally similar"))
+            why = _met(self.mdp, general, state, steps, ", none locally similar")
+            return _uniform(general, state, self._method(), why)
         # Those nearer were refused when their ring was reached, or the search would have ended there.
-        candidates = np.flatnonzero(np.asarray(general.visited) & (steps == radius))
+        candidates = _experts(self.mdp, general, state)
+        candidates = candidates[steps[candidates] == radius]
         label = self.similarity.classes.label
         similar = self.similarity.decide(np.full(len(candidates), label[state]), label[candidates], mutual=self.mutual)
         voters = candidates[similar]
         here, options = np.full(len(voters), state), (self.similarity.distance, self.similarity.anchored)
         reason = f"{_voted(voters)}, {_steps(radius)} away."
         return dataclasses.replace(
-            _mean_of(general, state, self._method(), reason, voters, steps[voters]),
+            _mean_of(general, state, self._method(), reason, voters, steps[voters], mdp=self.mdp),
             forward=certified_maps(self.mdp, here, voters, *options),
             backward=certified_maps(self.mdp, voters, here, *options) if self.mutual else None,
         )
@@ -75,62 +78,65 @@ class ByHops:
         steps = steps_from(self.mdp, state)
         radius = int(general.radius[state])
         if radius < 0:
-            return _uniform(general, state, method, _met(general, steps))
-        voters = np.flatnonzero(np.asarray(general.visited) & (steps == radius))
-        return _mean_of(general, state, method, f"{_voted(voters)}, {_steps(radius)} away.", voters, steps[voters])
+            return _uniform(general, state, method, _met(self.mdp, general, state, steps))
+        voters = _experts(self.mdp, general, state)
+        voters = voters[steps[voters] == radius]
+        reason = f"{_voted(voters)}, {_steps(radius)} away."
+        return _mean_of(general, state, method, reason, voters, steps[voters], mdp=self.mdp)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ByCoordinates:
     """k-NN by Euclidean distance; `coordinates` is [S, D]."""
 
+    mdp: MDP
     coordinates: np.ndarray
 
     def __call__(self, general: Generalized, state: int) -> Explanation:
-        experts = np.flatnonzero(general.visited)
+        method = "nearest neighbours (Euclidean)"
+        experts = _experts(self.mdp, general, state)
+        if int(general.radius[state]) < 0:
+            return _uniform(general, state, method, "no demonstrated state has a vote here")
         square = square_distances(self.coordinates[[state]], self.coordinates[experts])
         votes_for = is_nearest(square)[0]
         voters, distances = experts[votes_for], np.sqrt(square[0, votes_for])
         reason = f"{_voted(voters)}, at distance {distances[0]:.4g}."
-        return _mean_of(general, state, "nearest neighbours (Euclidean)", reason, voters, distances)
+        return _mean_of(general, state, method, reason, voters, distances, mdp=self.mdp)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ByGlobalMap:
-    """LP (8): its map [S, E] to the demonstrated states and the bounds on its optimal error."""
+    """LP (8): its map [S, E] to `experts` [E], demonstrated states, and the bounds on its optimal error."""
 
     mdp: MDP
+    experts: np.ndarray
     mapping: np.ndarray
     lower: float
     upper: float
     anchored: bool
 
     def __call__(self, general: Generalized, state: int) -> Explanation:
+        kind = "anchored" if self.anchored else "as printed"
+        method = f"LP (8), {kind}, one map for all states with {self.lower:.3g} <= error <= {self.upper:.3g}"
+        if int(general.radius[state]) < 0:
+            why = "no demonstrated state that the map sends it to has a vote here"
+            return _uniform(general, state, method, why)
         shares = self.mapping[state] / self.mapping[state].sum()
         chosen = self.mapping[state] > LEAST_SHARE
-        voters = np.flatnonzero(general.visited)[chosen]
-        kind = "anchored" if self.anchored else "as printed"
+        voters = self.experts[chosen]
         rest = shares[~chosen].sum()
         others = f", {rest:.2g} of it to others" if rest else ""
         reason = f"the map sends it to {_states(len(voters))}{others}."
-        return Explanation(
-            state=state,
-            method=f"LP (8), {kind}, one map for all states with {self.lower:.3g} <= error <= {self.upper:.3g}",
-            reason=reason,
-            radius=int(general.radius[state]),
-            policy=np.asarray(general.policy[state]),
-            voters=voters,
-            weights=shares[chosen],
-            voter_policies=np.asarray(general.policy)[voters],
-            distances=steps_from(self.mdp, state)[voters],
-        )
+        distances = steps_from(self.mdp, state)[voters]
+        return _mean_of(general, state, method, reason, voters, distances, shares[chosen], mdp=self.mdp)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ByOccupancy:
-    """The regression; `occupancy` is its x [S, A]."""
+    """The regression; `occupancy` is its x [S, A], `num_experts` how many states its data are."""
 
     occupancy: np.ndarray
+    num_experts: int
 
     def __call__(self, general: Generalized, state: int) -> Explanation:
         x = self.occupancy[state]
@@ -138,7 +144,7 @@ class ByOccupancy:
             why = f"the fitted occupancy of {x.sum():.2g} is too little to read a policy off"
             return _uniform(general, state, "regression", why)
         reason = (
-            f"no state voted: the occupancy fitted to {_states(int(np.sum(general.visited)))} is {x.sum():.3g} here, "
+            f"no state voted: the occupancy fitted to {_states(self.num_experts)} is {x.sum():.3g} here, "
             "and the policy is the share of each action in it."
         )
         return _mean_of(general, state, "regression", reason)
@@ -155,9 +161,23 @@ def demonstrated(general: Generalized, state: int) -> Explanation:
     return _mean_of(general, state, "the demonstrations alone", reason, [state], [0.0])
 
 
-def _mean_of(general, state: int, method: str, reason: str, voters=(), distances=()) -> Explanation:
-    """The mean of the voters' policies."""
+def _experts(mdp: MDP, general: Generalized, state: int) -> np.ndarray:
+    """The demonstrated states that have a vote in a state, by number."""
+    experts = np.flatnonzero(evidence.deciding(mdp, general.visited))
+    return experts[evidence.has_vote(mdp, general.policy, np.full(len(experts), state), experts)]
+
+
+def _mean_of(general, state: int, method: str, reason: str, voters=(), distances=(), weights=None, mdp=None):
+    """The mean of the voters' policies, alike if `weights` is None; of what they say that `mdp` allows in the state."""
     voters = np.asarray(voters, int)
+    weights = np.full(len(voters), 1.0) / max(len(voters), 1) if weights is None else weights
+    policies = np.asarray(general.policy)[voters]
+    if mdp is not None and mdp.restricts_actions and len(voters):
+        policies = evidence.allowed_part(mdp, np.full(len(voters), state), policies)
+        counted = policies.sum(axis=1)
+        policies = policies / np.where(counted > 0, counted, 1.0)[:, None]
+        weights = weights * counted / (weights @ counted)
+        reason += " Votes for actions that it lacks do not count." * bool((counted < 1.0 - 1e-9).any())
     return Explanation(
         state=state,
         method=method,
@@ -165,8 +185,8 @@ def _mean_of(general, state: int, method: str, reason: str, voters=(), distances
         radius=int(general.radius[state]),
         policy=np.asarray(general.policy[state]),
         voters=voters,
-        weights=np.full(len(voters), 1.0) / max(len(voters), 1),
-        voter_policies=np.asarray(general.policy)[voters],
+        weights=weights,
+        voter_policies=policies,
         distances=np.asarray(distances, float),
     )
 
@@ -175,14 +195,19 @@ def _uniform(general, state: int, method: str, why: str) -> Explanation:
     return _mean_of(general, state, method, f"nothing was found, so the policy is uniform: {why}.")
 
 
-def _met(general, steps: np.ndarray, qualification: str = "") -> str:
+def _met(mdp: MDP, general, state: int, steps: np.ndarray, qualification: str = "") -> str:
     """What the set of states within t steps had met when it stopped growing."""
     reached = np.isfinite(steps)
-    count = int((reached & np.asarray(general.visited)).sum())
     everything = f"all states that it leads to lie within {_steps(int(steps[reached].max()))}"
+    count = int((reached & np.asarray(general.visited)).sum())
     if not count:
         return f"{everything}, and no demonstrated state is among them"
-    return f"{everything}; {_states(count)} among them{qualification}"
+    voters = int(reached[_experts(mdp, general, state)].sum())
+    if not voters:
+        return (
+            f"{everything}; {_states(count)} among them, without a vote: they absorb, or took what is not allowed here"
+        )
+    return f"{everything}; {_states(voters)} among them{qualification}"
 
 
 def _voted(voters) -> str:

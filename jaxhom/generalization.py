@@ -1,7 +1,8 @@
 """Ways to extend the expert's policy from the demonstrated states to all states.
 
 Every function takes a model and demonstrations and returns a `Generalization`: on demonstrated states the empirical
-action frequencies, elsewhere what the method makes of them.
+action frequencies, elsewhere what the method makes of them. What was done in absorbing states is no evidence for other
+states, and votes for actions that a state lacks do not count (`evidence`).
 
 Algorithm 1 of Boularias and Chaib-draa 2010 (`soft_local_homomorphism`) grows the set s^t of states within t steps
 of an unvisited state s. At the first t at which s^t holds a demonstrated state that is locally similar to s, all
@@ -11,14 +12,13 @@ Whatever the method, `Generalization.explain` says where a state's policy came f
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom import checks
+from jaxhom import checks, evidence
 from jaxhom.demonstrations import Demonstrations, empirical_policy
 from jaxhom.explainers import (
     ByCoordinates,
@@ -29,24 +29,22 @@ from jaxhom.explainers import (
 )
 from jaxhom.explanation import Explanation
 from jaxhom.homomorphism import ClassSimilarity
+from jaxhom.inputs import as_model
 from jaxhom.local_models import LocalModelClasses, local_model_classes
 from jaxhom.mdp import MDP
 from jaxhom.votes import Votes, vote_of_nearest, vote_of_rings
 
+_ARRAYS = ("policy", "visited", "radius", "support", "error_lower", "error_upper")
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["policy", "visited", "radius", "support", "error_lower", "error_upper"],
-    meta_fields=[],
-    drop_fields=["explainer"],
-)
+
+@jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Generalization:
     """A policy for every state, and where each state's came from.
 
     Attributes:
-      policy: [S, A], rows sum to 1.
-      visited: bool [S], the demonstrated states.
+      policy: [S, A], rows sum to 1; 0 on actions that are not allowed.
+      visited: bool [S], the demonstrated states, absorbing ones included.
       radius: int32 [S], how far the method had to look (steps); 0 on demonstrated states, -1 where nothing was
         found and the policy is uniform.
       support: int32 [S], how many demonstrated states voted; 1 on demonstrated states, 0 where nothing was found.
@@ -64,6 +62,15 @@ class Generalization:
     error_lower: jax.Array | None = None
     error_upper: jax.Array | None = None
     explainer: Callable[["Generalization", int], Explanation] | None = None
+
+    def tree_flatten_with_keys(self):
+        """The arrays, by name; what explains is dropped."""
+        return tuple((jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in _ARRAYS), None
+
+    @classmethod
+    def tree_unflatten(cls, _, arrays) -> "Generalization":
+        """The generalization of these arrays, which has forgotten how it was made."""
+        return cls(**dict(zip(_ARRAYS, arrays, strict=True)))
 
     def replace(self, **changes) -> "Generalization":
         """Returns the generalization with the given fields exchanged."""
@@ -135,6 +142,7 @@ def soft_local_homomorphism(
 
     Source: Boularias and Chaib-draa 2010, Algorithm 1; anchoring and `mutual` are additions.
     """
+    mdp = as_model(mdp)
     if not threshold >= 0:
         raise ValueError(f"threshold must not be negative, got {threshold}")
     if not tolerance > 0:
@@ -146,16 +154,21 @@ def soft_local_homomorphism(
         raise ValueError("similarity was made with another distance, threshold, anchored or tolerance")
     label = similarity.classes.label
 
-    def accept(state, expert):
-        return similarity.decide(label[state], label[expert], mutual=mutual, progress=progress)
-
     start = maximum_entropy(mdp, demonstrations)
+    may_vote = _voters(mdp, start)
+
+    def accept(state, expert):
+        accepted = may_vote(state, expert)
+        pairs = label[state[accepted]], label[expert[accepted]]
+        accepted[accepted] = similarity.decide(*pairs, mutual=mutual, progress=progress)
+        return accepted
+
     if states is not None:
         states = checks.as_host_array("states", states)
         checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == (mdp.num_states,))
         states = states.astype(bool)
     explainer = ByHomomorphism(mdp, similarity, mutual, states)
-    return _extend(start, _vote_of_rings(mdp, start, accept, states), explainer)
+    return _extend(mdp, start, _vote_of_rings(mdp, start, accept, states), explainer)
 
 
 def class_similarity(
@@ -209,10 +222,10 @@ def nearest_neighbors(
 
     Source: Boularias and Chaib-draa 2010, section VI (k-NN).
     """
+    mdp = as_model(mdp)
     if metric == "hops":
         start = maximum_entropy(mdp, demonstrations)
-        votes = _vote_of_rings(mdp, start, lambda state, expert: np.ones(len(state), bool))
-        return _extend(start, votes, ByHops(mdp))
+        return _extend(mdp, start, _vote_of_rings(mdp, start, _voters(mdp, start)), ByHops(mdp))
     if metric != "euclidean":
         raise ValueError(f'metric must be "hops" or "euclidean", got {metric!r}')
     if coordinates is None:
@@ -222,12 +235,13 @@ def nearest_neighbors(
     checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
     coordinates = checks.require_floats("coordinates", coordinates)
     start = maximum_entropy(mdp, demonstrations)
-    votes = vote_of_nearest(np.asarray(start.visited), np.asarray(start.policy), coordinates)
-    return _extend(start, votes, ByCoordinates(coordinates))
+    accept = _voters(mdp, start) if mdp.restricts_actions else None
+    votes = vote_of_nearest(evidence.deciding(mdp, start.visited), np.asarray(start.policy), coordinates, accept)
+    return _extend(mdp, start, votes, ByCoordinates(mdp, coordinates))
 
 
 def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
-    """The uniform policy on every state that was not demonstrated.
+    """The uniform policy over the allowed actions on every state that was not demonstrated.
 
     Args:
       mdp: the model.
@@ -241,6 +255,7 @@ def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
 
     Source: Boularias and Chaib-draa 2010, section VI.
     """
+    mdp = as_model(mdp)
     visited, policy = empirical_policy(mdp, demonstrations)
     return Generalization(
         policy=policy,
@@ -251,6 +266,12 @@ def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
     )
 
 
+def _voters(mdp: MDP, start: Generalization):
+    """Decides pairs (states [P], demonstrated states [P]): whether the second may vote in the first at all."""
+    decides, policy = evidence.deciding(mdp, start.visited), np.asarray(start.policy)
+    return lambda state, expert: decides[expert] & evidence.has_vote(mdp, policy, state, expert)
+
+
 def _vote_of_rings(mdp: MDP, start: Generalization, accept, states=None) -> Votes:
     """The rings around the states that are neither demonstrated nor left out by `states`, bool [S]."""
     visited = np.asarray(start.visited)
@@ -258,5 +279,13 @@ def _vote_of_rings(mdp: MDP, start: Generalization, accept, states=None) -> Vote
     return vote_of_rings(mdp, visited, np.asarray(start.policy), asking, accept)
 
 
-def _extend(start: Generalization, votes: Votes, explainer) -> Generalization:
-    return start.replace(**{name: jnp.asarray(array) for name, array in votes._asdict().items()}, explainer=explainer)
+def _extend(mdp: MDP, start: Generalization, votes: Votes, explainer) -> Generalization:
+    """The votes where nothing was demonstrated."""
+    policy = evidence.policy_of_votes(mdp, votes.policy)[0] if mdp.restricts_actions else votes.policy
+    visited = start.visited
+    return start.replace(
+        policy=jnp.where(visited[:, None], start.policy, policy),
+        radius=jnp.where(visited, start.radius, votes.radius),
+        support=jnp.where(visited, start.support, votes.support),
+        explainer=explainer,
+    )

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jaxhom import evidence
 from jaxhom.demonstrations import Demonstrations
 from jaxhom.explainers import LEAST_SHARE, ByGlobalMap
 from jaxhom.generalization import Generalization, maximum_entropy
+from jaxhom.inputs import as_model
 from jaxhom.local_models import restricted_model
 from jaxhom.mdp import MDP
 from jaxhom.pdhg import engine
@@ -32,15 +34,17 @@ def soft_homomorphism(
 
     Args:
       mdp: the model.
-      demonstrations: the expert's trajectories, visiting E states.
-      anchored: map every demonstrated state to itself; False is the program as printed.
+      demonstrations: the expert's trajectories, visiting E states that do not absorb.
+      anchored: map each of these states to itself; False is the program as printed.
       tolerance: gap between the bounds on the optimal error to settle for.
       max_iterations: of PDHG; each costs a few products with [S, A, E] numbers.
       progress: show a progress bar.
 
     Returns:
       `Generalization` with `error_lower` and `error_upper`. pi(s, .) = sum_s' f(s, s') pi(s', .) off the
-      demonstrated states; their `radius` is 1, and `support` counts the states with f(s, s') > 1e-3.
+      demonstrated states, over the actions allowed there; their `radius` is 1, and `support` counts the states with
+      f(s, s') > 1e-3. Where nothing is left of it, or only absorbing states were demonstrated (there is no map then,
+      and the error is infinite), the policy is uniform, with radius -1 and support 0.
 
     Raises:
       ValueError: if a demonstration does not fit the model, or the tolerance is not positive.
@@ -49,26 +53,33 @@ def soft_homomorphism(
     """
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
+    mdp = as_model(mdp)
     start = maximum_entropy(mdp, demonstrations)
-    experts = np.flatnonzero(np.asarray(start.visited))
+    experts = np.flatnonzero(evidence.deciding(mdp, start.visited))
+    if not experts.size:
+        mapping, lower, upper = np.zeros((mdp.num_states, 0)), np.inf, np.inf
+    else:
+        problem = _problem(mdp, experts, anchored)
+        state = _solve_with_progress(problem, tolerance, max_iterations, progress)
+        mapping, lower, upper = np.asarray(state.best_primal[..., 0]), state.lower[0], state.upper[0]
+    policy, is_found = evidence.policy_of_votes(mdp, mapping @ np.asarray(start.policy)[experts])
+    visited = start.visited
+    return start.replace(
+        policy=jnp.where(visited[:, None], start.policy, jnp.asarray(policy, mdp.dtype)),
+        radius=jnp.where(visited, 0, np.where(is_found, 1, -1)).astype(jnp.int32),
+        support=jnp.where(visited, 1, np.where(is_found, (mapping > LEAST_SHARE).sum(axis=1), 0)).astype(jnp.int32),
+        error_lower=jnp.asarray(lower, mdp.dtype),
+        error_upper=jnp.asarray(upper, mdp.dtype),
+        explainer=ByGlobalMap(mdp, experts, mapping, float(lower), float(upper), anchored),
+    )
+
+
+def _problem(mdp: MDP, experts: np.ndarray, anchored: bool) -> GlobalHomomorphismProblem:
     pinned = np.zeros((mdp.num_states, len(experts)), bool)
     if anchored:
         pinned[experts, np.arange(len(experts))] = True
-    problem = GlobalHomomorphismProblem(
+    return GlobalHomomorphismProblem(
         mdp=mdp, restricted=jnp.asarray(restricted_model(mdp, experts)), pinned=jnp.asarray(pinned)
-    )
-    state = _solve_with_progress(problem, tolerance, max_iterations, progress)
-    mapping = state.best_primal[..., 0]
-    voted = mapping @ start.policy[experts]
-    visited = start.visited
-    lower, upper = state.lower[0], state.upper[0]
-    return start.replace(
-        policy=jnp.where(visited[:, None], start.policy, voted / voted.sum(axis=1, keepdims=True)),
-        radius=jnp.where(visited, 0, 1).astype(jnp.int32),
-        support=jnp.where(visited, 1, (mapping > LEAST_SHARE).sum(axis=1)).astype(jnp.int32),
-        error_lower=lower,
-        error_upper=upper,
-        explainer=ByGlobalMap(mdp, np.asarray(mapping), float(lower), float(upper), anchored),
     )
 
 

@@ -15,6 +15,9 @@ their transpose, lists of (s, a, slot) entries per s', so that derivatives reach
 *Dense layout.* Where N is near S the slots are the states themselves (`probability` is T) and both maps are
 matrix products. The choice is made once, in the constructors.
 
+*Actions that some states lack.* `allowed[s, a]` says which actions exist. Where one does not, its row of probabilities
+and its features are zero, and no policy may take it.
+
 Sweeps take a trailing batch axis: v is [S] or [S, B], x is [S, A] or [S, A, B]. Batch last is what XLA's CPU
 backend vectorises.
 """
@@ -29,6 +32,8 @@ from jaxhom import checks
 from jaxhom.padded_rows import PaddedRows, gather_sum, narrow_width, pad_rows
 from jaxhom.policy_chain import Edges, find_edges
 
+_REPLACEABLE = ("discount", "initial", "features", "probability", "allowed")
+_MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one: programs would take minutes to compile
 _DENSE_FRACTION = 0.25  # dense layout from N >= S / 4 on, where products beat gathers
 
 
@@ -43,11 +48,13 @@ class MDP:
       initial: float [S], distribution of the first state.
       features: float [S, A, K]; the unknown reward is sum_i w_i features[..., i] with w_i >= 0.
       discount: float scalar, strictly between 0 and 1.
+      allowed: bool [S, A], the actions that exist in each state, one at least.
       wide_pairs: int32 [J], flat (s, a) indices of the pairs with successors beyond the narrow width.
       wide_successors: int32 [N], the successors of all these pairs, if they are the same (restarts); else None.
       predecessors: per state s', the flat (s, a, slot) entries that lead to it; None in the dense layout.
       edges: the graph's edges, for the chains of policies; None in the dense layout.
       narrow_width: slots that every sweep reads for every pair.
+      restricts_actions: whether some state lacks some action.
     """
 
     next_state: jax.Array
@@ -55,53 +62,60 @@ class MDP:
     initial: jax.Array
     features: jax.Array
     discount: jax.Array
+    allowed: jax.Array
     wide_pairs: jax.Array
     wide_successors: jax.Array | None
     predecessors: PaddedRows | None
     edges: Edges | None
     narrow_width: int = dataclasses.field(metadata={"static": True})
+    restricts_actions: bool = dataclasses.field(metadata={"static": True})
 
     @classmethod
-    def from_dense(cls, transition, *, discount, initial=None, features=None) -> "MDP":
+    def from_dense(cls, transition, *, discount, initial=None, features=None, allowed=None) -> "MDP":
         """Builds a model from its transition tensor.
 
         Args:
-          transition: [S, A, S], transition[s, a, s'] = T(s, a, s'); rows sum to 1.
+          transition: [S, A, S], transition[s, a, s'] = T(s, a, s'); rows sum to 1. Sums within 1e-5 of 1 (1e-4 in
+            float32) are accepted, and the rows divided by them.
           discount: scalar, strictly between 0 and 1.
-          initial: [S] distribution of the first state; uniform if None.
+          initial: [S] distribution of the first state, to the same tolerance; uniform if None.
           features: [S, A, K], or [S, K] for features of the state alone; no features (K = 0) if None.
+          allowed: bool [S, A], which actions exist in each state, one at least; all if None. What the other pairs have
+            in `transition` and `features` is not looked at.
 
         Returns:
           The model, in the dtype of `transition` (integers become floats).
 
         Raises:
-          ValueError: on a wrong shape, on more than 2^31 - 2 entries, or naming the first entry that is NaN, negative
-            or out of range, or the first row that does not sum to 1.
+          ValueError: on a wrong shape, on more than 2^31 - 2 entries, naming the first entry that is NaN, negative
+            or out of range, the first row that does not sum to 1, or the first state without an action.
         """
         transition = checks.as_host_array("transition", transition)
         shape = transition.shape
         good = len(shape) == 3 and shape[0] == shape[2] and min(shape, default=0) > 0
         checks.require_shape("transition", transition, "[S, A, S] with S, A >= 1", good)
         checks.require_slots(*shape)
-        transition = checks.require_distribution("transition", transition)
+        allowed = _validated_allowed(allowed, shape[:2])
+        transition = checks.require_distribution("transition", transition, None if allowed.all() else allowed)
         num_states = shape[0]
         width = int((transition > 0).sum(axis=-1).max())
         if width >= _DENSE_FRACTION * num_states:
             next_state = np.broadcast_to(np.arange(num_states, dtype=np.int32), shape)
-            return cls._assemble(next_state, transition, discount, initial, features)
+            return cls._assemble(next_state, transition, discount, initial, features, allowed)
         next_state, probability = _compress(transition, width)
-        return cls._assemble(next_state, probability, discount, initial, features)
+        return cls._assemble(next_state, probability, discount, initial, features, allowed)
 
     @classmethod
-    def from_successors(cls, next_state, probability, *, discount, initial=None, features=None) -> "MDP":
+    def from_successors(cls, next_state, probability, *, discount, initial=None, features=None, allowed=None) -> "MDP":
         """Builds a model from lists of successors, without ever making the dense tensor of a sparse model.
 
         Args:
           next_state: integers [S, A, N] in [0, S). A successor that is listed twice counts with the sum.
-          probability: [S, A, N]; rows sum to 1. Padding has probability 0 and any valid state.
+          probability: [S, A, N]; rows sum to 1, as in `from_dense`. Padding has probability 0 and any valid state.
           discount: scalar, strictly between 0 and 1.
           initial: [S] distribution of the first state; uniform if None.
           features: [S, A, K] or [S, K]; no features (K = 0) if None.
+          allowed: bool [S, A], as in `from_dense`.
 
         Returns:
           The model, in the dtype of `probability`.
@@ -116,30 +130,29 @@ class MDP:
         same = probability.shape == next_state.shape
         checks.require_shape("probability", probability, str(next_state.shape), same)
         checks.require_slots(*next_state.shape)
+        allowed = _validated_allowed(allowed, next_state.shape[:2])
+        if not allowed.all():
+            next_state = np.where(allowed[..., None], next_state, 0)
         next_state = checks.require_integers("next_state", next_state, upper=len(next_state))
-        probability = checks.require_distribution("probability", probability)
+        probability = checks.require_distribution("probability", probability, None if allowed.all() else allowed)
         next_state, probability = _merge_repeated(next_state, probability)
         num_states, num_actions, width = next_state.shape
         if width >= _DENSE_FRACTION * num_states:
             checks.require_slots(num_states, num_actions, num_states)
-            return cls.from_dense(
-                _scatter_dense(next_state, probability),
-                discount=discount,
-                initial=initial,
-                features=features,
-            )
-        return cls._assemble(next_state, probability, discount, initial, features)
+            transition = _scatter_dense(next_state, probability)
+            return cls.from_dense(transition, discount=discount, initial=initial, features=features, allowed=allowed)
+        return cls._assemble(next_state, probability, discount, initial, features, allowed)
 
     @classmethod
-    def _assemble(cls, next_state, probability, discount, initial, features) -> "MDP":
-        num_states, num_actions, width = next_state.shape
+    def _assemble(cls, next_state, probability, discount, initial, features, allowed) -> "MDP":
+        num_states, _, width = next_state.shape
         dtype = jnp.asarray(probability[:1, :1]).dtype  # float64 becomes float32 unless x64 is on
         if initial is None:
             initial = np.full(num_states, 1.0 / num_states)
         initial = checks.as_host_array("initial", initial)
         checks.require_shape("initial", initial, f"({num_states},)", initial.shape == (num_states,))
         initial = checks.require_distribution("initial", initial)
-        features = _validated_features(features, num_states, num_actions, dtype)
+        features = _validated_features(features, allowed, dtype)
         discount = checks.require_discount(discount, dtype)
         _require_contraction(probability, discount)
         dense = width == num_states
@@ -160,24 +173,50 @@ class MDP:
             initial=jnp.asarray(initial, dtype),
             features=jnp.asarray(features, dtype),
             discount=jnp.asarray(discount, dtype),
+            allowed=jnp.asarray(allowed),
             wide_pairs=jnp.asarray(wide_pairs),
             wide_successors=wide_successors,
             predecessors=jax.tree.map(jnp.asarray, predecessors),
             edges=jax.tree.map(jnp.asarray, edges),
             narrow_width=slots,
+            restricts_actions=not allowed.all(),
         )
 
     def replace(self, **changes) -> "MDP":
-        """Returns the model with the given arrays exchanged (unchecked; usable under jit, vmap and grad).
+        """Returns the model with the given arrays exchanged; usable under jit, vmap and grad.
 
-        A new `probability` must keep the zero pattern: successors are not searched for again. New numbers get the type
-        of those that they replace, so that what was compiled for the model serves the new one too.
+        New numbers get the type of those that they replace, so that what was compiled for the model serves the new one
+        too. Concrete arrays go through the constructors' checks, traced ones through none but those of shapes.
+
+        Args:
+          **changes: `discount`, `initial`, `features` ([S, A, K] or [S, K]), `probability` in the layout that the model
+            has, without a successor that was not there: successors are not searched for again; `allowed`, which may
+            only take actions away.
+
+        Raises:
+          ValueError: if another field is named, or a concrete array is not what the constructors would take.
         """
+        fields = {field.name for field in dataclasses.fields(self)}
+        if not hasattr(self.probability, "dtype") or not changes.keys() <= fields:  # descriptions, such as vmap's axes
+            return dataclasses.replace(self, **changes)
         for name in changes:
-            old = getattr(self, name, None)
-            if hasattr(old, "dtype"):
-                changes[name] = jnp.asarray(changes[name], old.dtype)
-        return dataclasses.replace(self, **changes)
+            if name not in _REPLACEABLE:
+                raise ValueError(f"{name} cannot be replaced ({', '.join(_REPLACEABLE)} can): build a new model")
+        model = self._without_actions(changes.pop("allowed")) if "allowed" in changes else self
+        return dataclasses.replace(model, **{name: _replacement(model, name, new) for name, new in changes.items()})
+
+    def _without_actions(self, allowed) -> "MDP":
+        """The model with fewer actions."""
+        allowed = _validated_allowed(allowed, self.allowed.shape)
+        checks.require_all("allowed", allowed, ~allowed | np.asarray(self.allowed), "is a pair without transitions")
+        keep = jnp.asarray(allowed)[..., None]
+        return dataclasses.replace(
+            self,
+            allowed=jnp.asarray(allowed),
+            probability=jnp.where(keep, self.probability, 0.0),
+            features=jnp.where(keep, self.features, 0.0),
+            restricts_actions=not allowed.all(),
+        )
 
     @property
     def num_states(self) -> int:
@@ -219,6 +258,8 @@ def expected_next_value(mdp: MDP, value: jax.Array) -> jax.Array:
     """The backward map: E[value(s') | s, a], [S] -> [S, A] or [S, B] -> [S, A, B]."""
     if mdp.is_dense:
         return jnp.tensordot(mdp.probability, value, axes=1)
+    if mdp.num_actions > _MAX_UNROLLED_ACTIONS:
+        return gather_sum(*_narrow_rows(mdp, value))
     return jnp.stack(expected_next_values(mdp, value), axis=1)
 
 
@@ -232,6 +273,12 @@ def expected_next_values(mdp: MDP, value: jax.Array) -> list[jax.Array]:
         return list(jnp.moveaxis(expected_next_value(mdp, value), 1, 0))
     if value.ndim == 2 and value.shape[1] == 1:  # gathers of single numbers, not of rows of one
         return [expected[:, None] for expected in expected_next_values(mdp, value[:, 0])]
+    index, weight, value = _narrow_rows(mdp, value)
+    return [gather_sum(index[:, a], weight[:, a], value) for a in range(mdp.num_actions)]
+
+
+def _narrow_rows(mdp: MDP, value: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Indices and weights [S, A, W], and the values that they read: E[value(s') | s, a] is their `gather_sum`."""
     width, slots = mdp.narrow_width, mdp.next_state.shape[-1]
     index, weight = mdp.next_state[..., :width], mdp.probability[..., :width]
     if mdp.wide_pairs.size:
@@ -246,7 +293,7 @@ def expected_next_values(mdp: MDP, value: jax.Array) -> list[jax.Array]:
         index = _replace_pairs(index, mdp.wide_pairs, jnp.where(first, lookup[:, None], 0))
         weight = _replace_pairs(weight, mdp.wide_pairs, first.astype(weight.dtype))
         value = jnp.concatenate([value, expectation])
-    return [gather_sum(index[:, a], weight[:, a], value) for a in range(mdp.num_actions)]
+    return index, weight, value
 
 
 def _replace_pairs(rows: jax.Array, pairs: jax.Array, replacement: jax.Array) -> jax.Array:
@@ -284,11 +331,16 @@ def state_transition(mdp: MDP, policy: jax.Array) -> jax.Array:
     return zeros.at[rows, mdp.next_state].add(weight)
 
 
-def check_policy_shape(mdp: MDP, policy: jax.Array, name: str = "policy") -> None:
-    """Raises `ValueError` unless `policy` is [S, A] or [B, S, A] for this model."""
-    shape = (mdp.num_states, mdp.num_actions)
-    good = jnp.ndim(policy) in (2, 3) and policy.shape[-2:] == shape
-    checks.require_shape(name, policy, f"{shape} or (B, {shape[0]}, {shape[1]})", good)
+def absorbing_states(mdp: MDP) -> jax.Array:
+    """bool [S]: the states that every allowed action stays in with certainty; works under jit and vmap."""
+    leaves = mdp.next_state != jnp.arange(mdp.num_states, dtype=mdp.next_state.dtype)[:, None, None]
+    return jnp.where(leaves, mdp.probability, 0.0).sum(axis=(1, 2)) == 0
+
+
+def uniform_policy(mdp: MDP) -> jax.Array:
+    """[S, A]: every allowed action alike; works under jit and vmap."""
+    allowed = mdp.allowed.astype(mdp.dtype)
+    return allowed / allowed.sum(axis=-1, keepdims=True)
 
 
 def _compress(transition: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -306,23 +358,24 @@ def _compress(transition: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _merge_repeated(next_state, probability) -> tuple[np.ndarray, np.ndarray]:
-    """Sorts each row by successor, adds repeated ones up, and drops slots that no row uses."""
-    num_states = len(next_state)
-    next_state = np.where(probability > 0, next_state, num_states)  # padding sorts last
-    order = np.argsort(next_state, axis=-1, kind="stable")
-    next_state = np.take_along_axis(next_state, order, axis=-1)
-    probability = np.take_along_axis(probability, order, axis=-1)
-    is_first = np.ones(next_state.shape, bool)
-    is_first[..., 1:] = next_state[..., 1:] != next_state[..., :-1]
-    is_first &= next_state < num_states
-    group = np.cumsum(is_first, axis=-1) - 1
-    width = int(group.max()) + 1
-    s, a, slot = np.nonzero(next_state < num_states)
-    merged_state = np.zeros((*next_state.shape[:2], width), np.int32)
-    merged = np.zeros((*next_state.shape[:2], width), probability.dtype)
-    merged_state[s, a, group[s, a, slot]] = next_state[s, a, slot]
-    np.add.at(merged, (s, a, group[s, a, slot]), probability[s, a, slot])
-    return merged_state, merged
+    """Sorts each row by successor, adds repeated ones up, and drops slots that no row uses.
+
+    Done on the entries alone: with one row of thousands of successors nearly all of the arrays is padding.
+    """
+    num_states, num_actions, slots = next_state.shape
+    entry = np.flatnonzero(probability > 0)
+    key = entry // slots * num_states + next_state.ravel()[entry]
+    order = np.argsort(key, kind="stable")
+    key, entry = key[order], entry[order]
+    begin = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+    merged = np.add.reduceat(probability.ravel()[entry], begin)
+    pair, successor = np.divmod(key[begin], num_states)
+    slot = np.arange(len(pair)) - np.searchsorted(pair, pair)
+    shape = (num_states * num_actions, int(slot.max()) + 1)
+    merged_state, merged_probability = np.zeros(shape, np.int32), np.zeros(shape, probability.dtype)
+    merged_state[pair, slot], merged_probability[pair, slot] = successor, merged
+    shape = (num_states, num_actions, -1)
+    return merged_state.reshape(shape), merged_probability.reshape(shape)
 
 
 def _scatter_dense(next_state, probability) -> np.ndarray:
@@ -341,8 +394,48 @@ def _require_contraction(probability: np.ndarray, discount: np.ndarray) -> None:
     checks.require_all("sum of probability", total, total * np.float64(discount) < 1.0, message)
 
 
-def _validated_features(features, num_states: int, num_actions: int, dtype) -> np.ndarray:
-    """Returns features as [S, A, K] in the model's type, or raises."""
+def _replacement(mdp: MDP, name: str, new) -> jax.Array:
+    """What `MDP.replace` puts in the place of a field; checked as far as it is concrete."""
+    old = getattr(mdp, name)
+    if checks.is_traced(new, mdp):
+        if name == "features" and jnp.ndim(new) == 2 and jnp.shape(new)[0] == mdp.num_states:
+            new = jnp.broadcast_to(jnp.asarray(new)[:, None], (*old.shape[:2], jnp.shape(new)[1]))
+        good = jnp.shape(new) == old.shape or (name == "features" and jnp.shape(new)[:-1] == old.shape[:-1])
+        checks.require_shape(name, new, str(old.shape), good)
+        return jnp.asarray(new, old.dtype)
+    if name == "discount":
+        return jnp.asarray(checks.require_discount(new, old.dtype))
+    allowed = np.asarray(mdp.allowed)
+    if name == "features":
+        return jnp.asarray(_validated_features(new, allowed, old.dtype), old.dtype)
+    new = checks.as_host_array(name, new)
+    checks.require_shape(name, new, str(old.shape), new.shape == old.shape)
+    if name == "initial":
+        return jnp.asarray(checks.require_distribution(name, new), old.dtype)
+    new = checks.require_distribution(name, new, allowed if mdp.restricts_actions else None)
+    if not mdp.is_dense:
+        was_there = np.asarray(old) > 0
+        checks.require_all(name, new, (new == 0) | was_there, "is a successor that the model did not have")
+    return jnp.asarray(new, old.dtype)
+
+
+def _validated_allowed(allowed, shape: tuple[int, int]) -> np.ndarray:
+    """Which actions exist, bool [S, A], or raises."""
+    if allowed is None:
+        return np.ones(shape, bool)
+    allowed = checks.as_host_array("allowed", allowed)
+    checks.require_shape("allowed", allowed, str(tuple(shape)), allowed.shape == tuple(shape))
+    if allowed.dtype != bool:
+        raise ValueError(f"allowed must be bool, got dtype {allowed.dtype}")
+    some = allowed.any(axis=1)
+    if not some.all():
+        raise ValueError(f"allowed[{int(np.argmin(some))}] allows no action: a state needs one at least")
+    return allowed
+
+
+def _validated_features(features, allowed: np.ndarray, dtype) -> np.ndarray:
+    """Returns features as [S, A, K] in the model's type, zero where an action is not allowed; or raises."""
+    num_states, num_actions = allowed.shape
     if features is None:
         return np.zeros((num_states, num_actions, 0))
     features = checks.as_host_array("features", features)
@@ -350,6 +443,8 @@ def _validated_features(features, num_states: int, num_actions: int, dtype) -> n
     by_pair = features.ndim == 3 and features.shape[:2] == (num_states, num_actions)
     expected = f"({num_states}, {num_actions}, K) or ({num_states}, K)"
     checks.require_shape("features", features, expected, by_state or by_pair)
+    if by_pair and not allowed.all():
+        features = np.where(allowed[..., None], features, 0)
     features = checks.require_floats_in(dtype, "features", features)
     if by_pair:
         return features

@@ -7,10 +7,11 @@ Boularias and Chaib-draa 2010, section VI ("nonlinear regression"): with p the c
 and x(s, a) = pi(s, a) sum_a' x(s, a') with the expert's frequencies pi on demonstrated states. The policy elsewhere is
 x(s, a) / sum_a' x(s, a'), eq. (5).
 
-What a demonstrated state does is one variable, its mu(s) = sum_a x(s, a), so that its constraints need no rows. An
-interior-point method solves the program (`sparse_interior_point`: 0.4 s for a 48 x 48 grid, where HiGHS takes 15);
-where rounding stops it too early, SciPy's HiGHS does. The optimal x need not be unique: the interior-point method ends
-in the middle of the optimal ones.
+What a demonstrated state does is one variable, its mu(s) = sum_a x(s, a), so that its constraints need no rows.
+Absorbing states count as not demonstrated, and actions that are not allowed have no variable. An interior-point method
+solves the program (`sparse_interior_point`: 0.4 s for a 48 x 48 grid, where HiGHS takes 15); where rounding stops it
+too early, SciPy's HiGHS does. The optimal x need not be unique: the interior-point method ends in the middle of the
+optimal ones.
 """
 
 import jax.numpy as jnp
@@ -18,10 +19,11 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse
 
-from jaxhom import checks
+from jaxhom import checks, evidence
 from jaxhom.demonstrations import Demonstrations, empirical_policy
 from jaxhom.explainers import ByOccupancy
 from jaxhom.generalization import Generalization
+from jaxhom.inputs import as_model
 from jaxhom.mdp import MDP
 from jaxhom.normal_equations import Rows, flow_matrix
 from jaxhom.sparse_interior_point import solve
@@ -40,8 +42,8 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
       coordinates: [S, D], positions of the states.
 
     Returns:
-      `Generalization`. `radius` is 1 off the demonstrated states, and `support` the number of demonstrated states, all
-      of which have a say; -1 and 0 where the state hardly ever occurs and the policy is uniform.
+      `Generalization`. `radius` is 1 off the demonstrated states, and `support` the number of demonstrated states that
+      do not absorb, all of which have a say; -1 and 0 where the state hardly ever occurs and the policy is uniform.
 
     Raises:
       ValueError: if a demonstration does not fit the model, or `coordinates` do not.
@@ -49,22 +51,23 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
 
     Source: Boularias and Chaib-draa 2010, section VI; the linear program is written out above.
     """
+    mdp = as_model(mdp)
     coordinates = checks.as_host_array("coordinates", coordinates)
     good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
     checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
     basis = quadratic_basis(checks.require_floats("coordinates", coordinates))
     visited, empirical = (np.asarray(array) for array in empirical_policy(mdp, demonstrations))
-    x = _solve(mdp, basis, _expansion(visited, empirical)).reshape(empirical.shape)
-    total = x.sum(axis=1, keepdims=True)
-    occurs = total[:, 0] > _NO_OCCUPANCY / (1.0 - float(mdp.discount))
-    policy = np.where(occurs[:, None], x / np.where(total > 0, total, 1.0), 1.0 / mdp.num_actions)
+    decides = evidence.deciding(mdp, visited)
+    x = _solve(mdp, basis, _expansion(mdp, decides, empirical)).reshape(empirical.shape)
+    occurs = x.sum(axis=1) > _NO_OCCUPANCY / (1.0 - float(mdp.discount))
+    policy, _ = evidence.policy_of_votes(mdp, np.where(occurs[:, None], x, 0.0))
     found = np.where(occurs, 1, -1)
     return Generalization(
         policy=jnp.asarray(np.where(visited[:, None], empirical, policy), mdp.dtype),
         visited=jnp.asarray(visited),
         radius=jnp.asarray(np.where(visited, 0, found), jnp.int32),
-        support=jnp.asarray(np.where(visited, 1, visited.sum() * occurs), jnp.int32),
-        explainer=ByOccupancy(x),
+        support=jnp.asarray(np.where(visited, 1, decides.sum() * occurs), jnp.int32),
+        explainer=ByOccupancy(x, int(decides.sum())),
     )
 
 
@@ -78,13 +81,14 @@ def quadratic_basis(coordinates: np.ndarray) -> np.ndarray:
     return left[:, size > 1e-10 * size[0]]
 
 
-def _expansion(visited: np.ndarray, empirical: np.ndarray) -> scipy.sparse.csr_array:
-    """[S A, m]: x as a function of mu(s) on demonstrated states and of x(s, a) on the others."""
+def _expansion(mdp: MDP, decides: np.ndarray, empirical: np.ndarray) -> scipy.sparse.csr_array:
+    """[S A, m]: x as a function of mu(s) on demonstrated states and of x(s, a), where allowed, on the others."""
     num_states, num_actions = empirical.shape
     state = np.repeat(np.arange(num_states), num_actions)
     demonstrated = scipy.sparse.csr_array((empirical.ravel(), (np.arange(empirical.size), state)))
     others = scipy.sparse.eye_array(empirical.size, format="csr")
-    return scipy.sparse.hstack([demonstrated[:, visited], others[:, ~visited[state]]], format="csr")
+    is_free = ~decides[state] & np.asarray(mdp.allowed).ravel()
+    return scipy.sparse.hstack([demonstrated[:, decides], others[:, is_free]], format="csr")
 
 
 def _solve(mdp: MDP, basis: np.ndarray, expansion) -> np.ndarray:

@@ -48,7 +48,7 @@ def _(primals, tangents):
     policy = primals[2]
 
     def of_policy(mdp, reward):
-        value = policy_value(mdp, policy, reward)
+        value = policy_value(mdp, policy, jnp.where(jnp.isfinite(reward), reward, 0.0))  # not 0 times -inf
         expected = expected_next_value(mdp, value.T)  # batch last
         return value, reward + mdp.discount * (expected if value.ndim == 1 else jnp.moveaxis(expected, -1, 0))
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from jaxhom.padded_rows import PaddedRows, gather_sum, pad_rows, sum_rows
 
+_MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -107,10 +109,13 @@ def policy_chain(edges: Edges, probability: jax.Array, policy: jax.Array) -> Pol
     """The chain of a policy [S, A], or of a batch that comes last, [S, A, B], for probabilities [S, A, N]."""
     entries = jnp.append(probability.ravel(), jnp.zeros((), probability.dtype))  # the sentinel's 0
     batch = policy.shape[2:]
-    weight = sum(
-        policy[edges.source, a] * entries[edges.entry[:, a]].reshape(-1, *(1,) * len(batch))
-        for a in range(policy.shape[1])
-    )
+    if policy.shape[1] > _MAX_UNROLLED_ACTIONS:
+        weight = jnp.einsum("ea...,ea->e...", policy[edges.source], entries[edges.entry])
+    else:
+        weight = sum(
+            policy[edges.source, a] * entries[edges.entry[:, a]].reshape(-1, *(1,) * len(batch))
+            for a in range(policy.shape[1])
+        )
     weight = jnp.concatenate([weight, jnp.zeros((1, *batch), weight.dtype)])
     source, target = (jnp.append(states, 0) for states in (edges.source, edges.target))
     return PolicyChain(

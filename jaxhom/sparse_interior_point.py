@@ -15,6 +15,7 @@ import chex
 import numpy as np
 
 from jaxhom.normal_equations import Rows
+from jaxhom.status import Status
 
 _TO_BOUNDARY = 0.995
 _PATIENCE = 30  # steps without a smaller error, after which rounding has won
@@ -31,7 +32,8 @@ class InteriorPoint:
     Attributes:
       z: [m], positive. f: [q]. y: [n], multipliers of the rows. s: [m], positive, c - A^T y up to a residual.
       error: the largest of z . s and of what the residuals are worth in the objective, see `_error`.
-      iterations: steps taken.
+      iterations: steps taken to it.
+      steps: steps taken in all. status: SOLVED, or why the steps ended.
     """
 
     z: np.ndarray
@@ -40,6 +42,8 @@ class InteriorPoint:
     s: np.ndarray
     error: float = np.inf
     iterations: int = 0
+    steps: int = 0
+    status: Status = Status.STALLED
 
 
 def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_iterations: int = 100) -> InteriorPoint:
@@ -52,24 +56,38 @@ def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_it
       max_iterations: steps at most.
 
     Returns:
-      The iterate with the least `error`.
+      The iterate with the least `error`; with a factorisation that fails from the beginning, one of ones and zeros.
 
     Source: Mehrotra 1992; Gondzio 1996; Wright 1997, chapter 10.
     """
     program = (cost, free_cost, right)
-    point = best = _start(rows, *program)
-    for iteration in range(max_iterations):
-        residuals = _residuals(rows, *program, point)
-        point = point.replace(error=_error(residuals, point), iterations=iteration)
-        if point.error < best.error:
-            best = point
-        if best.error <= tolerance or iteration - best.iterations >= _PATIENCE:
-            break
-        try:
+    best, status = _nowhere(rows, cost, right), Status.STALLED
+    taken = 0
+    try:
+        point = _start(rows, *program)
+        for taken in range(max_iterations + 1):
+            residuals = _residuals(rows, *program, point)
+            point = point.replace(error=_error(residuals, point), iterations=taken)
+            if point.error < best.error:
+                best = point
+            if best.error <= tolerance:
+                status = Status.SOLVED
+                break
+            if taken - best.iterations >= _PATIENCE or not np.isfinite(point.error):
+                break
+            if taken == max_iterations:
+                status = Status.ITERATION_LIMIT
+                break
             point = _step(rows, residuals, point)
-        except np.linalg.LinAlgError:  # a normal matrix that rounding has made indefinite
-            break
-    return best
+    except np.linalg.LinAlgError:  # a normal matrix that rounding has made indefinite
+        pass
+    return best.replace(steps=taken, status=status)
+
+
+def _nowhere(rows: Rows, cost, right) -> InteriorPoint:
+    """What there is before anything is known."""
+    free = np.zeros(rows.free_columns.shape[1])
+    return InteriorPoint(z=np.ones(len(cost)), f=free, y=np.zeros(len(right)), s=np.ones(len(cost)))
 
 
 def _start(rows: Rows, cost, free_cost, right) -> InteriorPoint:

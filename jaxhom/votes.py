@@ -55,13 +55,23 @@ def vote_of_rings(mdp: MDP, visited, policy, asking, accept: Callable[[np.ndarra
     return found
 
 
-def vote_of_nearest(visited, policy, coordinates: np.ndarray) -> Votes:
-    """The demonstrated states at the least Euclidean distance in `coordinates` [S, D], ties included."""
+def vote_of_nearest(visited, policy, coordinates: np.ndarray, accept=None) -> Votes:
+    """The demonstrated states at the least Euclidean distance in `coordinates` [S, D], ties included.
+
+    `accept` decides pairs as in `vote_of_rings`; all are accepted if None.
+    """
     found = _no_votes(visited, policy)
     experts, waiting = np.flatnonzero(visited), np.flatnonzero(~visited)
+    if not experts.size:
+        return found
     chunk = max(1, _CHUNK_BYTES // (8 * coordinates[experts].size))
     for states in np.split(waiting, range(chunk, len(waiting), chunk)):
         square = square_distances(coordinates[states], coordinates[experts])
+        if accept is not None:
+            pairs = (array.ravel() for array in np.broadcast_arrays(states[:, None], experts))
+            square = np.where(accept(*pairs).reshape(square.shape), square, np.inf)
+        is_found = np.isfinite(square.min(axis=1))
+        states, square = states[is_found], square[is_found]
         votes_for = is_nearest(square)
         found.support[states] = votes_for.sum(axis=1)
         found.policy[states] = votes_for @ policy[experts] / found.support[states, None]

@@ -93,12 +93,18 @@ def empirical_policy(num_states, num_actions, trajectories):
     return visited, policy
 
 
-def monte_carlo_feature_expectations(features, discount, trajectories):
-    """Eq. (6) [K]: Vhat_i = 1/M sum_m sum_t discount^t phi_i(s_t, a_t), the first t being 0."""
+def monte_carlo_feature_expectations(features, discount, trajectories, ends=None):
+    """Eq. (6) [K]: Vhat_i = 1/M sum_m sum_t discount^t phi_i(s_t, a_t), the first t being 0.
+
+    `ends[m]`, if it is not None, is the distribution [S] of the state in which trajectory m is absorbed after its last
+    step: from there on every action is as likely as any other.
+    """
     total = np.zeros(features.shape[2])
-    for states, actions in trajectories:
+    for m, (states, actions) in enumerate(trajectories):
         for t, (s, a) in enumerate(zip(states, actions, strict=True)):
             total += discount**t * features[s, a]
+        if ends is not None and ends[m] is not None:
+            total += discount ** len(states) / (1 - discount) * ends[m] @ features.mean(axis=1)
     return total / len(trajectories)
 
 
@@ -129,6 +135,12 @@ def successors(transition, s):
 def grow(transition, states):
     """The set s^(t+1) from the set s^t: `states` and all their successors."""
     return set(states).union(*(successors(transition, s) for s in states))
+
+
+def absorbing(transition):
+    """bool [S]: the states that no action leaves; what was done there is no evidence for other states."""
+    states = np.arange(len(transition))
+    return (transition[states, :, states] > 1 - 1e-12).all(axis=1)
 
 
 def reach(transition, s, steps):
@@ -180,13 +192,14 @@ def homomorphism_residual(source, target, mapping):
     return np.max(np.abs(through_source - through_target))
 
 
-def homomorphism_lp(source, target, anchored=True, labels=None):
+def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
     """LP (9) between `source` [n, A, n] and `target` [m, A, m]: (error, map [n, m]).
 
     Minimise e over f >= 0 with sum_k f(i, k) = 1 and, for all i, k, a,
     |sum_j T(i, a, j) f(j, k) - sum_j f(i, j) T'(j, a, k)| <= e.
     `anchored` requires in addition f(0, 0) = 1: state 0 is the centre of both models. `labels`, [n, A, L] and
-    [m, A, L], add |l(i, a) - sum_k f(i, k) l'(k, a)| <= e for every label.
+    [m, A, L], add |l(i, a) - sum_k f(i, k) l'(k, a)| <= e for every label. `refused`: the last state of each model is
+    mapped to the other, and nothing else is.
     The variables are f, row by row, and e.
     """
     n, num_actions, _ = source.shape
@@ -207,6 +220,9 @@ def homomorphism_lp(source, target, anchored=True, labels=None):
     bounds = [(0.0, None)] * (n * m + 1)
     if anchored:
         bounds[0] = (1.0, 1.0)
+    if refused:
+        for i in range(n):
+            bounds[i * m + m - 1] = (float(i == n - 1),) * 2
     result = _solve_lp(
         cost=np.append(np.zeros(n * m), 1.0),
         A_ub=sparse.block_array([[difference, minus_e], [-difference, minus_e]]),
@@ -262,8 +278,9 @@ def algorithm1(
         return one_way and (not mutual or error(other, s) <= threshold + tolerance)
 
     policy, radius = empirical.copy(), np.zeros(num_states, dtype=int)
+    voters = visited & ~absorbing(transition)
     for s in np.flatnonzero(~visited).tolist():
-        policy[s], radius[s] = _vote(transition, s, visited, empirical, similar)
+        policy[s], radius[s] = _vote(transition, s, voters, empirical, similar)
     return policy, radius
 
 
@@ -276,8 +293,9 @@ def hops_nearest_neighbors(transition, trajectories):
     num_states, num_actions, _ = transition.shape
     visited, empirical = empirical_policy(num_states, num_actions, trajectories)
     policy, radius = empirical.copy(), np.zeros(num_states, dtype=int)
+    voters = visited & ~absorbing(transition)
     for s in np.flatnonzero(~visited).tolist():
-        policy[s], radius[s] = _vote(transition, s, visited, empirical, lambda s, other: True)
+        policy[s], radius[s] = _vote(transition, s, voters, empirical, lambda s, other: True)
     return policy, radius
 
 
@@ -299,18 +317,19 @@ def _vote(transition, s, visited, empirical, similar):
         previous = current
 
 
-def euclidean_nearest_neighbors(coordinates, num_actions, trajectories):
+def euclidean_nearest_neighbors(coordinates, num_actions, trajectories, absorbs=False):
     """Euclidean k-NN on `coordinates` [S, 2]: (policy [S, A], distance float [S]).
 
-    All demonstrated states at the distance of the nearest one vote (ties up to rounding).
+    All demonstrated states at the distance of the nearest one vote (ties up to rounding), but for those that absorb,
+    bool [S].
     """
     coordinates = np.asarray(coordinates, dtype=float)
     visited, empirical = empirical_policy(len(coordinates), num_actions, trajectories)
     policy, nearest = empirical.copy(), np.zeros(len(coordinates))
     for s in np.flatnonzero(~visited):
         distances = np.sqrt(np.sum((coordinates - coordinates[s]) ** 2, axis=1))
-        nearest[s] = distances[visited].min()
-        voters = visited & (distances <= nearest[s] * (1 + 1e-9))
+        nearest[s] = distances[visited & ~np.asarray(absorbs)].min()
+        voters = visited & ~np.asarray(absorbs) & (distances <= nearest[s] * (1 + 1e-9))
         policy[s] = empirical[voters].mean(axis=0)
     return policy, nearest
 

@@ -15,16 +15,25 @@ PACKAGE = ROOT / "jaxhom"
 # The table of the design: a module imports only from rows with a smaller number than its own.
 # Inside a package (pdhg, lpal, domains, interop, plotting, cli) the modules may import one another, one way.
 ROWS = {
+    "interrupts": -1,  # signals and pipes
+    "status": -1,  # how an answer ended
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
     "canonical_forms": -1,  # arrays in, keys out
     "first_order": -1,  # a value in, the same value out
     "padded_rows": -1,  # arrays in, arrays out
     "policy_chain": -0.5,
     "mdp": 0,
+    "inputs": 0.5,
+    "chain_solver": 0.5,
+    "host_chains": 0.5,
     "occupancy": 1,
+    "policy_iteration": 1.05,
     "planning_sensitivity": 1.1,
     "planning": 1.2,
+    "impossible_steps": 0.6,
+    "episode_ends": 0.6,
     "demonstrations": 1,
+    "host_graph": 0.6,
     "local_models": 1,
     "lane_queue": 0.5,
     "inverse_factor": 0.5,
@@ -41,6 +50,7 @@ ROWS = {
     "homomorphism_map": 2,
     "certified_maps": 2,
     "lpal": 2,
+    "evidence": 2,
     "votes": 2,
     "explanation": 2.3,
     "explainers": 2.6,

@@ -1,6 +1,7 @@
 """Demonstrations: frequencies and eq. (6) against plain loops; samples against distributions."""
 
 import importlib
+import pickle
 import re
 
 import chex
@@ -47,13 +48,13 @@ def test_ragged_trajectories_are_padded_and_masked():
 @pytest.mark.parametrize(
     "trajectories",
     [
-        iter([((0.0, 3.0), (1.0, 1.0))]),
-        np.array([[[0, 3], [1, 1]]], np.uint8),
-        [(jnp.array([0, 3]), np.array([1, 1]))],
+        iter([((0.0, 3.0, 3.0), (1.0, 1.0, 0.0))]),
+        np.array([[[0, 3, 3], [1, 1, 0]]], np.uint8),
+        [(jnp.array([0, 3, 3]), np.array([1, 1, 0]))],
     ],
 )
 def test_any_whole_numbers_in_any_sequence_will_do(trajectories):
-    expected = Demonstrations.from_trajectories([([0, 3], [1, 1])])
+    expected = Demonstrations.from_trajectories([([0, 3, 3], [1, 1, 0])])
     chex.assert_trees_all_equal(Demonstrations.from_trajectories(trajectories), expected)
 
 
@@ -62,7 +63,9 @@ def test_any_whole_numbers_in_any_sequence_will_do(trajectories):
     [
         ([], "at least one trajectory is needed, got none"),
         ([([0], [0]), ([], [])], "trajectory 1 is empty"),
-        ([([0], [0]), ([0, 1, 2], [0, 1])], "trajectory 1 has 3 states and 2 actions"),
+        ([([0], [0]), ([0, 1, 2, 3], [0, 1])], "trajectory 1 has 4 states and 2 actions: as many are needed, or one"),
+        ([([0, 1], [0, 1, 2])], "trajectory 0 has 2 states and 3 actions"),
+        ([([0], [])], "trajectory 0 is empty"),
         ([([0],)], "trajectory 0 must be a pair (states, actions)"),
         ([([0], [0], [1.0])], "trajectory 0 must be a pair (states, actions)"),
         ([3], "trajectory 0 must be a pair (states, actions)"),
@@ -74,11 +77,21 @@ def test_any_whole_numbers_in_any_sequence_will_do(trajectories):
         ([([0, 2**31], [0, 1])], "trajectory 0 states[1] must be below 2147483647, got 2147483648"),
         ([(["left"], [0])], "trajectory 0 states must hold integers, got dtype <U4"),
         (None, "trajectories must be a sequence of pairs (states, actions), got NoneType"),
+        ([[(3, 1), (4, 0)]], "trajectory 0 could be (states, actions) or two steps (state, action), got [(3, 1), (4"),
+        ([((3, 1), (4, 0))], "trajectory 0 could be"),
+        ([[[3, 1], [4, 0]]] * 2, "trajectory 0 could be"),
+        (np.array([[[3, 1], [4, 0]]]), "trajectory 0 could be"),
     ],
 )
 def test_from_trajectories_refuses(trajectories, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         Demonstrations.from_trajectories(trajectories)
+
+
+def test_two_steps_are_what_longer_trajectories_show_them_to_be():
+    demonstrations = Demonstrations.from_trajectories([[(3, 4), (1, 0)], [(0, 1, 2), (1, 1, 0)]])
+    np.testing.assert_array_equal(demonstrations.states[0, :2], [3, 4])
+    np.testing.assert_array_equal(demonstrations.actions[0, :2], [1, 0])
 
 
 def test_one_long_trajectory_among_many_is_refused_before_it_is_padded():
@@ -125,6 +138,57 @@ def test_padding_is_not_validated():
     junk.validate(small_models.case("dense").mdp)
 
 
+def test_ends_of_trajectories():
+    trajectories = [([0, 1, 5], [0, 2]), ([4, 6], [1]), ([1, 1], [2, 2])]
+    demonstrations = Demonstrations.from_trajectories(trajectories, terminated=[True, False, False])
+    np.testing.assert_array_equal(demonstrations.terminated, [True, False, False])
+    np.testing.assert_array_equal(demonstrations.final_states, [5, 6, -1])
+    np.testing.assert_array_equal(demonstrations.mask, [[True, True], [True, False], [True, True]])
+    np.testing.assert_array_equal(demonstrations.states, [[0, 1], [4, 0], [1, 1]])
+    chex.assert_type([demonstrations.terminated, demonstrations.final_states], [bool, jnp.int32])
+    assert not np.any(Demonstrations.from_trajectories(trajectories).terminated)
+
+
+@pytest.mark.parametrize(
+    ("terminated", "message"),
+    [([True], "terminated must have shape (2,), got (1,)"), ([0, 1], "terminated must be bool, got dtype int64")],
+)
+def test_flags_that_do_not_fit_are_refused(terminated, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Demonstrations.from_trajectories([([0], [0])] * 2, terminated)
+
+
+def test_they_are_a_sequence_of_trajectories():
+    trajectories = [([0, 1, 5], [0, 2]), ([4], [1]), ([1, 1, 2], [2, 2])]
+    demonstrations = Demonstrations.from_trajectories(trajectories, [True, False, False])
+    assert len(demonstrations) == 3
+    chex.assert_trees_all_equal(list(demonstrations), [(np.array(s), np.array(a)) for s, a in trajectories])
+    chex.assert_trees_all_equal(demonstrations[-1], demonstrations[np.int64(2)])
+    chex.assert_trees_all_equal(Demonstrations.from_trajectories(demonstrations, [True, False, False]), demonstrations)
+    for index in (slice(1, 3), np.array([1, 2]), np.array([False, True, True])):
+        some = demonstrations[index]
+        assert len(some) == 2 and some.horizon == 2
+        chex.assert_trees_all_equal(list(some), list(demonstrations)[1:])
+    with pytest.raises(IndexError):
+        demonstrations[3]
+
+
+def test_they_are_a_pytree_and_can_be_pickled():
+    """However they were made: without their ends, nobody is known to have terminated."""
+    full = Demonstrations.from_trajectories(RAGGED)
+    bare = Demonstrations(states=full.states, actions=full.actions, mask=full.mask)
+    for copy in (bare, pickle.loads(pickle.dumps(full)), jax.tree.map(jnp.array, full), full.replace(mask=full.mask)):
+        chex.assert_trees_all_equal(copy, full)
+        assert jax.tree.structure(copy) == jax.tree.structure(full)
+    lanes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), full)
+    axes = Demonstrations(states=0, actions=0, mask=0)
+    for in_axes in (0, axes, jax.tree.map(lambda _: 0, full)):
+        out = jax.vmap(lambda one: one.replace(terminated=~one.terminated), in_axes=(in_axes,))(lanes)
+        assert out.terminated.shape == (2, 3) and np.all(out.terminated)
+    inside = jax.jit(lambda states, actions, mask: Demonstrations(states=states, actions=actions, mask=mask))
+    chex.assert_trees_all_equal(inside(full.states, full.actions, full.mask), full)
+
+
 # ------------------------------------------------------- empirical policy, feature expectations
 
 
@@ -143,6 +207,7 @@ def test_frequencies_and_expectations_against_plain_loops(trajectories):
 
 @pytest.mark.parametrize("name", ["one_state", "absorbing", "restart"])
 def test_sampled_trajectories_against_plain_loops(name):
+    """The only state of the first has one action: what it does after nine steps is certain."""
     case = small_models.case(name)
     policy = small_models.random_policy(np.random.default_rng(1), *case.shape)
     trajectories = oracles.sample_trajectories(np.random.default_rng(2), case.transition, case.initial, policy, 4, 9)
@@ -150,7 +215,8 @@ def test_sampled_trajectories_against_plain_loops(name):
     visited, empirical = POLICY(case.mdp, demonstrations)
     expected = oracles.empirical_policy(*case.shape, trajectories)
     chex.assert_trees_all_close((np.asarray(visited), np.asarray(empirical)), expected, rtol=1e-15)
-    expected = oracles.monte_carlo_feature_expectations(case.features, case.discount, trajectories)
+    ends = [np.ones(1)] * 4 if name == "one_state" else None
+    expected = oracles.monte_carlo_feature_expectations(case.features, case.discount, trajectories, ends)
     actual = EXPECTATIONS(case.mdp, demonstrations)
     np.testing.assert_allclose(actual, expected, rtol=1e-13)
 
@@ -279,7 +345,7 @@ def test_sampled_expectations_approach_the_exact_ones():
     policy = small_models.random_policy(np.random.default_rng(4), *case.shape)
     demonstrations = sample_demonstrations(jax.random.key(5), case.mdp, policy, 1000, 100)
     # [20, M / 20, H]: on 20 groups
-    groups = jax.tree.map(lambda x: x.reshape(20, -1, x.shape[-1]), demonstrations)
+    groups = jax.tree.map(lambda x: x.reshape(20, -1, *x.shape[1:]), demonstrations)
     sample = jax.jit(jax.vmap(EXPECTATIONS, (None, 0)))(case.mdp, groups)
     error = np.std(sample, axis=0, ddof=1) / np.sqrt(20)
     expected = oracles.feature_expectations(*case.arrays, policy)
@@ -314,7 +380,7 @@ def test_one_state_and_one_step():
     mdp = MDP.from_dense(np.ones((1, 1, 1)), discount=0.5, features=np.ones((1, 1)))
     demonstrations = sample_demonstrations(jax.random.key(0), mdp, np.ones((1, 1)), 1, 1)
     assert not np.any(demonstrations.states) and not np.any(demonstrations.actions)
-    np.testing.assert_array_equal(monte_carlo_feature_expectations(mdp, demonstrations), [1.0])
+    np.testing.assert_array_equal(monte_carlo_feature_expectations(mdp, demonstrations), [2.0])  # for ever
 
 
 @pytest.mark.parametrize(
@@ -330,3 +396,65 @@ def test_sampling_refuses(policy_shape, num_trajectories, horizon, message):
     mdp = small_models.case("dense").mdp
     with pytest.raises(ValueError, match=message):
         sample_demonstrations(jax.random.key(0), mdp, np.ones(policy_shape) / 3, num_trajectories, horizon)
+
+
+def test_episodes_end_at_the_first_terminal_state():
+    """The same walks as without ends, up to the end."""
+    case = small_models.case("sparse")
+    policy = small_models.random_policy(np.random.default_rng(7), *case.shape)
+    terminal = np.arange(40) % 7 == 3
+    mdp = case.mdp.replace(initial=np.where(terminal, 0, 1) / (~terminal).sum())
+    options = jax.random.key(1), mdp, policy, 60, 6
+    walked = jax.tree.map(np.asarray, sample_demonstrations(*options))
+    cut = jax.tree.map(np.asarray, sample_demonstrations(*options, terminal=terminal))
+    chex.assert_shape([cut.states, cut.actions, cut.mask], (60, 6))
+    assert 0 < np.sum(cut.terminated) < 60
+    np.testing.assert_array_equal(walked.final_states, -1)
+    for lane in range(60):
+        ends = np.flatnonzero(terminal[walked.states[lane]])
+        length = ends[0] if len(ends) else 6
+        np.testing.assert_array_equal(cut.mask[lane], np.arange(6) < length)
+        for name in ("states", "actions"):
+            np.testing.assert_array_equal(getattr(cut, name)[lane, :length], getattr(walked, name)[lane, :length])
+            assert not np.any(getattr(cut, name)[lane, length:])
+        assert cut.terminated[lane] == terminal[cut.final_states[lane]]
+        if length < 6:
+            assert cut.final_states[lane] == walked.states[lane, length]
+    cut.validate(mdp)  # so the last step leads to the final state
+
+    def draw(key):
+        return sample_demonstrations(key, mdp, policy, 60, 6, terminal=terminal)
+
+    keys = jnp.stack([jax.random.key(2), jax.random.key(1)])
+    lanes = jax.tree.map(np.asarray, jax.jit(jax.vmap(draw))(keys))
+    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[1], lanes), cut)
+    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[0], lanes), jax.tree.map(np.asarray, draw(keys[0])))
+
+
+def test_an_episode_that_starts_at_its_end_has_no_step():
+    mdp = small_models.case("absorbing").mdp
+    terminal = np.arange(6) == 1
+    message = "terminal[1] must be False where episodes start: one that starts there has no step, got True"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        sample_demonstrations(jax.random.key(0), mdp, np.full((6, 2), 0.5), 1, 1, terminal=terminal)
+    draw = jax.jit(
+        lambda terminal: sample_demonstrations(jax.random.key(0), mdp, jnp.eye(6)[:, :2], 50, 2, terminal=terminal)
+    )
+    found = draw(jnp.asarray(terminal))
+    empty = ~np.asarray(found.mask)[:, 0]
+    assert 0 < empty.sum() < 50
+    np.testing.assert_array_equal(found.final_states[empty], 1)
+    assert np.all(np.asarray(found.terminated)[empty])
+
+
+@pytest.mark.parametrize(
+    ("terminal", "message"),
+    [
+        (np.zeros(6, bool), "terminal must have shape (7,), got (6,)"),
+        (np.zeros(7), "terminal must be bool, got dtype float64"),
+    ],
+)
+def test_terminal_states_that_are_none_are_refused(terminal, message):
+    mdp = small_models.case("dense").mdp
+    with pytest.raises(ValueError, match=re.escape(message)):
+        sample_demonstrations(jax.random.key(0), mdp, np.full((7, 3), 1 / 3), 1, 1, terminal=terminal)

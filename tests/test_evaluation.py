@@ -1,5 +1,7 @@
 """Evaluation, held to the oracle's scan, to answers known by hand, and to itself by sampling."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -217,7 +219,8 @@ def test_one_reward_serves_a_batch_of_policies(case):
 
 def test_the_dense_layout_is_the_sparse_one(case):
     transition, _ = case["numpy"]
-    dense = case["mdp"].replace(
+    dense = dataclasses.replace(
+        case["mdp"],
         probability=jnp.asarray(transition),
         next_state=jnp.broadcast_to(jnp.arange(S), transition.shape),
         predecessors=None,

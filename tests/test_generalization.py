@@ -219,7 +219,7 @@ def test_euclidean(name, scale):
 
 def test_euclidean_in_three_dimensions():
     """By hand: state 3 has two nearest states, 0 and 1, with two actions each."""
-    mdp = MDP.from_dense(np.repeat(np.eye(4)[:, None], 2, axis=1), discount=0.5)
+    mdp = MDP.from_dense(np.repeat(np.eye(4)[[1, 2, 3, 0]][:, None], 2, axis=1), discount=0.5)
     demonstrations = Demonstrations.from_trajectories([([0, 1, 2], [0, 1, 1]), ([1], [0])])
     coordinates = [[0, 0, 0], [2, 2, 2], [5, 5, 5], [1, 1, 1]]
     result = nearest_neighbors(mdp, demonstrations, metric="euclidean", coordinates=coordinates)
@@ -289,7 +289,7 @@ def test_states_that_cannot_reach_a_demonstrated_one_stay_uniform(method):
         transition[first:last, :, first:last] = block
     mdp = MDP.from_dense(transition, discount=0.9)
     for seen, by_hand in ((18, [0, -1, -1, -1]), (20, [2, 1, 0, -1])):
-        trajectories = [(np.array([4, seen]), np.array([2, 3]))]
+        trajectories = [(np.array([4]), np.array([2])), (np.array([seen]), np.array([3]))]
         result = method(mdp, Demonstrations.from_trajectories(trajectories))
         np.testing.assert_array_equal(result.radius[9:18], -1)
         np.testing.assert_array_equal(result.support[9:18], 0)
@@ -308,8 +308,8 @@ def test_states_that_cannot_reach_a_demonstrated_one_stay_uniform(method):
 @pytest.mark.parametrize("name", METHODS)
 def test_nothing_to_do_where_everything_was_visited(name):
     here = world("strip")
-    actions = np.arange(16) % 4
-    trajectories = [(np.arange(16), actions), (np.arange(16), actions), (np.arange(8), actions[1:9])]
+    pairs = [*(zip(range(16), np.arange(16) % 4, strict=True)), *zip(range(8), np.arange(1, 9) % 4, strict=True)]
+    trajectories = [(np.array([state]), np.array([action])) for state, action in pairs]
     result = METHODS[name](here.mdp, Demonstrations.from_trajectories(trajectories))
     _, expected = oracles.empirical_policy(16, 4, trajectories)
     np.testing.assert_allclose(result.policy, expected, rtol=0, atol=1e-15)

@@ -194,7 +194,6 @@ GOOD = {0: {0: [(1.0, 1, 0.0, True)]}, 1: {0: [(1.0, 1, 0.0, True)]}}
         (toy({}), "at least one state and one action"),
         (toy({0: {}, 1: {}}), "at least one state and one action"),
         (toy({1: GOOD[0], 2: GOOD[1]}), r"as P\[state\]\[action\], both numbered from 0: KeyError 0"),
-        (toy({0: GOOD[0], 1: {0: GOOD[1][0], 1: GOOD[1][0]}}), r"P\[1\] has 2 actions, but P\[0\] has 1"),
         (toy(3), r"as P\[state\]\[action\]"),
         (toy({**GOOD, 0: {0: [0.5, 0.5]}}), r"P\[0\]\[0\]\[0\] must be \(probability, next state, .*got 0.5"),
         (toy({**GOOD, 0: {0: [np.eye(3)]}}), r"P\[0\]\[0\]\[0\] must be"),
@@ -219,7 +218,7 @@ def test_environments_that_are_refused(env, message):
 
 def test_without_gymnasium_an_id_says_what_to_install_and_an_environment_needs_nothing(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(ImportError, match=r"pip install 'jaxhom\[interop\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[interop\]'"):
         from_gymnasium("FrozenLake-v1", discount=DISCOUNT)
     assert from_gymnasium(toy(GOOD), discount=DISCOUNT).mdp.num_states == 2
 

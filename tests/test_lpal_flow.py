@@ -85,7 +85,7 @@ def test_the_iteration_converges_to_the_program():
     for reading in problem.occupancies(state.primal, state.dual, state.weight):
         np.testing.assert_allclose(reading[..., 0] / (1 - arrays[1]), x, rtol=0, atol=1e-5)
     np.testing.assert_allclose(problem.weights(state.primal)[:, 0], weights, rtol=0, atol=1e-5)
-    assert state.steps[0] == 8 * flow._STEPS_PER_CERTIFICATE * engine.STEPS_PER_CHECK
+    assert state.steps[0] == 8 * flow._STEPS_PER_LOOK * engine.STEPS_PER_CHECK
 
 
 def test_proximal_steps(rng):

@@ -243,7 +243,7 @@ def test_one_compilation_serves_all_models_of_one_shape(rng):
     sweep = jax.jit(chex.assert_max_traces(expected_next_value, n=1))
     mdp = small_models.case("restart").mdp
     for discount in (0.5, 0.9):
-        other = mdp.replace(discount=jnp.asarray(discount), probability=mdp.probability * discount)
+        other = mdp.replace(discount=jnp.asarray(discount), initial=np.full(100, 0.01))
         sweep(other, rng.normal(size=100))
 
 
@@ -307,7 +307,6 @@ def test_constructors_refuse_discount(discount, message):
     [
         (1.0 - 1e-9, "got 0.999999999: that is 1.0 in float32"),
         (1e-60, "got 1e-60: that is 0.0 in float32"),
-        (0.99995, "sum of probability[1, 0] is too far above 1 for a discount of 0.99"),
     ],
 )
 def test_discounts_that_rounding_makes_useless_are_refused(discount, message):

@@ -6,6 +6,7 @@ along d to rounding: a finite difference without cancellation.
 
 import functools
 import importlib
+import time
 
 import chex
 import jax
@@ -15,6 +16,7 @@ import oracles
 import pytest
 import small_models
 
+from jaxhom import MDP, chain_solver
 from jaxhom.occupancy import feature_expectations, occupancy, policy_value
 
 occupancy_module = importlib.import_module("jaxhom.occupancy")  # `jaxhom.occupancy` is the function
@@ -53,18 +55,22 @@ def assert_close_by_scale(actual, expected, tolerance):
 
 
 def test_models_reach_both_solvers():
-    small = [occupancy_module.is_solved_by_lu(small_models.case(name).mdp) for name in SOLVERS]
+    small = [chain_solver.is_solved_by_lu(small_models.case(name).mdp) for name in SOLVERS]
     assert small == [True, True, False, False]
 
 
-def test_against_numpy(case, rng):
+BOTH_WAYS = pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["concrete", "jit"])
+
+
+@BOTH_WAYS
+def test_against_numpy(case, transform, rng):
     policy = small_models.random_policy(rng, *case.shape)
     reward = rng.normal(size=case.shape)
-    actual = results(case.mdp, policy, reward)
+    x, value = transform(two_solves)(case.mdp, policy, reward)
+    actual = (x, feature_expectations(case.mdp, policy), value)
     for got, want in zip(actual, expected_results(case, policy, reward), strict=True):
         assert_close_by_scale(np.asarray(got), want, 1e-10)
-    total = np.sum(actual[0])
-    np.testing.assert_allclose(total, 1 / (1 - case.discount), rtol=1e-10)
+    np.testing.assert_allclose(np.sum(x), 1 / (1 - case.discount), rtol=1e-10)
 
 
 def test_deterministic_policies(case, rng):
@@ -93,17 +99,65 @@ def test_extreme_discounts(name, discount, rng):
     mdp = case.mdp.replace(discount=np.asarray(discount))
     policy = small_models.random_policy(rng, *case.shape)
     reward = rng.normal(size=case.shape)
-    actual, expected = results(mdp, policy, reward), expected_results(case, policy, reward)
-    for got, want in zip(actual, expected, strict=True):
+    expected = expected_results(case, policy, reward)[::2]
+    for got, want in zip(jax.jit(two_solves)(mdp, policy, reward), expected, strict=True):
         assert_close_by_scale(np.asarray(got), want, 1e-9)
 
 
-def test_a_ring_that_hardly_mixes(rng):
+@BOTH_WAYS
+def test_a_ring_that_hardly_mixes(transform, rng):
     case = small_models.slow_ring()
     policy, reward = np.full(case.shape, [0.6, 0.4]), rng.normal(size=case.shape)
-    actual, expected = results(case.mdp, policy, reward), expected_results(case, policy, reward)
-    for got, want in zip(actual, expected, strict=True):
+    expected = expected_results(case, policy, reward)[::2]
+    for got, want in zip(transform(two_solves)(case.mdp, policy, reward), expected, strict=True):
         assert_close_by_scale(np.asarray(got), want, 1e-9)
+
+
+def corridor(num_states, discount, dtype=np.float64):
+    """Cells in a row, to the left and to the right, slipping the other way with probability 0.1."""
+    cell = np.arange(num_states)
+    ways = np.stack([np.maximum(cell - 1, 0), np.minimum(cell + 1, num_states - 1)], axis=-1)
+    next_state = np.stack([ways, ways[:, ::-1]], axis=1)
+    probability = np.broadcast_to(np.array([0.9, 0.1], dtype), next_state.shape)
+    return MDP.from_successors(next_state, probability, discount=discount)
+
+
+@BOTH_WAYS
+@pytest.mark.parametrize("discount", [0.999, 0.99999])
+def test_float32_says_what_float64_would(transform, discount, rng):
+    """The oracle is NumPy in float64 on the numbers that float32 holds, rows brought to 1."""
+    mdp = corridor(100, discount, np.float32)
+    policy = small_models.random_policy(rng, 100, 2).astype(np.float32)
+    reward = rng.uniform(size=(100, 2)).astype(np.float32)
+    x, value = transform(two_solves)(mdp, policy, reward)
+    transition = np.asarray(mdp.transition, float)
+    exact = transition / transition.sum(axis=-1, keepdims=True), float(mdp.discount)
+    exact_policy = policy.astype(float) / policy.sum(axis=1, keepdims=True, dtype=float)
+    assert x.dtype == value.dtype == np.float32
+    assert_close_by_scale(np.asarray(x), oracles.occupancy(*exact, np.asarray(mdp.initial, float), exact_policy), 1e-4)
+    assert_close_by_scale(np.asarray(value), oracles.policy_value(*exact, exact_policy, reward), 1e-4)
+    np.testing.assert_allclose(float(x.sum()), 1 / (1 - float(mdp.discount)), rtol=1e-4)
+
+
+def test_large_float32_models_are_right_or_nan_under_jit(rng):
+    mdp = corridor(2000, 0.99999, np.float32)
+    policy = small_models.random_policy(rng, 2000, 2).astype(np.float32)
+    assert np.isnan(jax.jit(occupancy)(mdp, policy)).all()
+    np.testing.assert_allclose(float(occupancy(mdp, policy).sum()), 1 / (1 - float(mdp.discount)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("discount", [0.9999, 0.999999, 1 - 1e-9])
+def test_long_corridors_take_no_longer_where_the_discount_is_near_one(discount, rng):
+    """SciPy's LU takes a few milliseconds; sweeps would take minutes."""
+    mdp = corridor(1000, discount)
+    policy = small_models.random_policy(rng, 1000, 2)
+    begin = time.perf_counter()
+    x = np.asarray(occupancy(mdp, policy))
+    assert time.perf_counter() - begin < 2.0
+    transition = np.einsum("sa,saz->sz", policy, np.asarray(mdp.transition))
+    missing = x.sum(axis=1) - discount * transition.T @ x.sum(axis=1) - np.asarray(mdp.initial)
+    assert np.abs(missing).max() <= 1e-14 * x.sum()
+    np.testing.assert_allclose(x.sum(), 1 / (1 - discount), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["dense", "restart"])
@@ -139,7 +193,7 @@ def test_a_policy_with_nan_gives_nan_in_its_lane_alone(name, rng):
     policies = small_models.random_policy(rng, 3, *case.shape)
     expected = oracles.occupancy(*case.arrays[:3], policies[1])
     policies[0, 2, 0] = np.nan
-    x = np.asarray(occupancy(case.mdp, policies))
+    x = np.asarray(jax.jit(occupancy)(case.mdp, policies))  # concrete, it would be refused
     assert np.isnan(x[0]).all()
     assert_close_by_scale(x[1], expected, 1e-10)
 
@@ -371,11 +425,11 @@ def test_rewards_of_another_shape_are_refused(policy_shape, reward_shape):
 def test_wide_batches_are_solved_some_lanes_at_a_time(monkeypatch, rng):
     """Two lanes at a time, the last of five beside a copy of itself."""
     case = small_models.case("restart")
-    monkeypatch.setattr(occupancy_module, "_CACHED_NUMBERS", 2 * case.shape[0])
+    monkeypatch.setattr(chain_solver, "_CACHED_NUMBERS", 2 * case.shape[0])
     policies, rewards = small_models.random_policy(rng, 5, *case.shape), rng.normal(size=(5, *case.shape))
     for solve in (occupancy_module._occupancy, occupancy_module._solve_values):
         solve.clear_cache()
-    measures, values = occupancy(case.mdp, policies), policy_value(case.mdp, policies, rewards)
+    measures, values = jax.jit(two_solves)(case.mdp, policies, rewards)
     gradient = jax.grad(lambda policies: (occupancy(case.mdp, policies) * rewards).sum())(policies)
     for i, policy in enumerate(policies):
         expected = oracles.occupancy(case.transition, case.discount, case.initial, policy)

@@ -1,6 +1,7 @@
 """Optimal plans against policy iteration in NumPy; residuals and bounds, by their definitions."""
 
 import functools
+import time
 
 import chex
 import jax
@@ -13,6 +14,9 @@ import small_models
 from jaxhom.domains import gridworld
 from jaxhom.mdp import MDP
 from jaxhom.planning import Plan, greedy_policy, optimal_policy
+from jaxhom.status import Status
+
+BOTH_WAYS = pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["concrete", "jit"])
 
 
 @pytest.fixture(params=["one_state", "dense", "absorbing", "sparse", "restart"])
@@ -48,10 +52,12 @@ def first_best(action_value, slack):
 # -------------------------------------------------------------------------------------- the numbers
 
 
-def test_against_policy_iteration(case):
+@BOTH_WAYS
+def test_against_policy_iteration(case, transform):
     reward = reward_of(case.name)
     value, action_value = optimum(case.name)
-    plan = optimal_policy(case.mdp, reward)
+    plan = transform(optimal_policy)(case.mdp, reward)
+    assert plan.status == Status.SOLVED
     chex.assert_shape([plan.policy, plan.action_value], case.shape)
     chex.assert_shape([plan.iterations, plan.residual], ())
     bound = float(plan.residual) / (1 - case.discount)
@@ -208,9 +214,9 @@ def test_batches_agree_with_single_rewards_lane_by_lane():
 
 def test_state_rewards_hold_for_every_action():
     case = small_models.case("dense")
-    rewards = np.random.default_rng(22).normal(size=(3, 7))
+    rewards = np.random.default_rng(22).normal(size=(4, 7))
     spread = np.repeat(rewards[..., None], 3, axis=2)
-    for state_reward, reward in ((rewards, spread), (rewards[0], spread[0])):
+    for state_reward, reward in ((rewards, spread), (rewards[0], spread[0]), (rewards[:3, :, None], spread[:3])):
         chex.assert_trees_all_equal(optimal_policy(case.mdp, state_reward), optimal_policy(case.mdp, reward))
 
 
@@ -259,7 +265,110 @@ def test_one_trace_serves_all_rewards_of_one_shape():
         plan(case.mdp, scale * reward_of("dense"))
 
 
+# ------------------------------------------------------------------- discounts near 1, ties, forbidden actions
+
+
+def two_classes(discount, dtype=np.float64):
+    """A corridor 0-1-2-3 whose end absorbs, and a state that absorbs at -3 and that nobody can reach."""
+    next_state = np.array([[0, 1], [0, 2], [1, 3], [3, 3], [4, 4]])[..., None]
+    reward = np.array([[-1, -1], [-1, -1], [-1, -1], [0, 0], [-3, -3]], dtype)
+    return MDP.from_successors(next_state, np.ones((5, 2, 1), dtype), discount=discount), reward
+
+
+@BOTH_WAYS
+@pytest.mark.parametrize(
+    ("dtype", "discount"), [(np.float64, 0.99999), (np.float64, 1 - 1e-10), (np.float32, 0.999), (np.float32, 0.99999)]
+)
+def test_two_recurrent_classes_and_a_discount_near_one(dtype, discount, transform):
+    mdp, reward = two_classes(discount, dtype)
+    plan = transform(optimal_policy)(mdp, reward)
+    g = float(mdp.discount)
+    tolerance = 1e-6 if dtype == np.float64 else 1e-5
+    np.testing.assert_allclose(plan.value[:4], [-1 - g - g**2, -1 - g, -1, 0], rtol=tolerance, atol=1e-12)
+    np.testing.assert_allclose(plan.value[4], -3 / (1 - g), rtol=1e-4)
+    assert plan.policy.argmax(axis=1)[:3].tolist() == [1, 1, 1]
+    assert plan.value.dtype == dtype and plan.status == Status.SOLVED
+
+
+@pytest.mark.parametrize("discount", [0.99, 0.9999, 0.999999])
+def test_deterministic_states_that_fall_into_many_classes(discount, rng):
+    """Sixty of them; every cycle is a class of its own."""
+    next_state, reward = rng.integers(60, size=(60, 3, 1)), rng.normal(size=(60, 3))
+    plan = optimal_policy(MDP.from_successors(next_state, np.ones((60, 3, 1)), discount=discount), reward)
+    value, _ = oracles.optimal_value(np.eye(60)[next_state[..., 0]], discount, reward)
+    np.testing.assert_allclose(plan.value, value, rtol=1e-8, atol=1e-8)
+    assert plan.status == Status.SOLVED
+
+
+def test_slow_lanes_of_a_batch_are_brought_to_the_end_and_the_others_stay(rng):
+    """Eight rewards, more than the host takes by itself; those over one class alone are quick."""
+    mdp, reward = two_classes(0.9999)
+    rewards = np.stack([reward * [[1], [1], [1], [1], [slow]] for slow in (0, 1) * 4])
+    plans = optimal_policy(mdp, rewards)
+    for lane, reward in enumerate(rewards):
+        value, _ = oracles.optimal_value(np.eye(5)[np.asarray(mdp.next_state)[..., 0]], 0.9999, reward)
+        np.testing.assert_allclose(plans.value[lane], value, rtol=1e-7, atol=1e-6)
+    assert (np.asarray(plans.status) == Status.SOLVED).all()
+
+
+@BOTH_WAYS
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("penalty", [-1e6, -np.inf])
+def test_a_penalty_that_is_never_paid_decides_nothing(penalty, dtype, transform):
+    """Six states in a row: left at a penalty, stay, right; staying in the last is worth 1."""
+    cell = np.arange(6)
+    next_state = np.stack([np.maximum(cell - 1, 0), cell, np.minimum(cell + 1, 5)], axis=1)[..., None]
+    mdp = MDP.from_successors(next_state, np.ones((6, 3, 1), dtype), discount=0.9)
+    reward = np.zeros((6, 3), dtype)
+    reward[:, 0], reward[5, 1] = penalty, 1
+    plan = transform(optimal_policy)(mdp, reward)
+    assert plan.policy.argmax(axis=1).tolist() == [2, 2, 2, 2, 2, 1]
+    np.testing.assert_allclose(plan.value[0], 5.9049, rtol=1e-5)
+    assert np.all(np.isfinite(np.asarray(plan.upper_bound(mdp))))
+
+
+@BOTH_WAYS
+def test_what_the_model_does_not_allow_is_never_planned_for(transform, rng):
+    """The oracle sees the same model with a penalty that nobody would pay."""
+    case = small_models.case("sparse")
+    reward = rng.normal(size=case.shape)
+    allowed = rng.uniform(size=case.shape) < 0.5
+    allowed[np.arange(len(allowed)), rng.integers(case.shape[1], size=len(allowed))] = True
+    mdp = case.mdp.replace(allowed=allowed)
+    plan = transform(optimal_policy)(mdp, np.where(allowed, reward, np.nan) if transform is not jax.jit else reward)
+    value, action_value = oracles.optimal_value(case.transition, case.discount, np.where(allowed, reward, -1e3))
+    np.testing.assert_allclose(plan.value, value, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(np.asarray(plan.action_value)[allowed], action_value[allowed], rtol=0, atol=1e-7)
+    assert (np.asarray(plan.action_value)[~allowed] == -np.inf).all() and not np.asarray(plan.policy)[~allowed].any()
+    gradient = jax.grad(lambda reward: optimal_policy(mdp, reward).value.sum())(reward)
+    assert np.isfinite(gradient).all() and not gradient[~allowed].any()
+
+
+def test_many_actions_compile_in_seconds(rng):
+    next_state, reward = rng.integers(40, size=(40, 200, 2)), rng.normal(size=(40, 200))
+    mdp = MDP.from_successors(next_state, np.full((40, 200, 2), 0.5), discount=0.9)
+    begin = time.perf_counter()
+    plan = jax.jit(optimal_policy)(mdp, reward)
+    assert time.perf_counter() - begin < 20  # 5 s on quiet cores; unrolled it took minutes
+    np.testing.assert_allclose(plan.value, optimal_policy(mdp, reward).value, rtol=1e-8)
+
+
 # ---------------------------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (np.full((7, 3), np.nan), r"reward\[0, 0\] must be finite, got nan"),
+        (np.full((7, 3), np.inf), r"reward\[0, 0\] must be finite, got inf"),
+        (np.where(np.arange(7)[:, None] == 4, -np.inf, np.zeros((7, 3))), r"reward\[4\] is -inf for every action"),
+        (np.zeros((2, 7, 3)) - np.array([0, np.inf])[:, None, None], r"reward\[1, 0\] is -inf for every action"),
+        (np.zeros((3, 7)), r"reward has shape \(3, 7\): transpose it"),
+    ],
+)
+def test_rewards_that_mean_nothing_are_refused(reward, message):
+    with pytest.raises(ValueError, match=message):
+        optimal_policy(small_models.case("dense").mdp, reward)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (6, 3), (7, 2), (2, 7, 2), (2, 6, 3), (1, 2, 7, 3)])

@@ -5,6 +5,8 @@ CliffWalking and whatever was written after them. Outcomes with one next state a
 
     r(s, a) = sum over outcomes of p r        an expected reward per pair, which is all that values depend on.
 
+A state may lack actions (no outcomes, or no entry): they are not allowed there. One without any outcome ends episodes.
+
 *Termination.* A table goes on after the end of an episode: the goal has rows of its own that lead on. Here a state
 that some outcome enters with `terminated` ends every episode: it becomes absorbing, with reward 0. That leaves all
 values from the initial states unchanged if such a state is never entered without `terminated` in the course of an
@@ -15,6 +17,7 @@ states of the environment stay as they are. That is right for every table.
 
 import dataclasses
 import warnings
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +26,8 @@ import scipy.sparse
 
 from jaxhom import checks
 from jaxhom.mdp import MDP
+
+_OUTSIDE_THE_TABLE = ("fickle_passenger",)  # options of Gymnasium's environments that act in `step` alone
 
 
 @jax.tree_util.register_dataclass
@@ -56,7 +61,8 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
       The model, with its reward and its terminal states.
 
     Raises:
-      ValueError: if there is no such environment; if it has no table `P` or no initial distribution; naming the first
+      ValueError: if there is no such environment; if it has no table `P` or no initial distribution, or an option that
+        its table does not contain; naming the first
         entry of the table that is malformed; naming a state in which some episodes end and others go on, unless
         `end_state`; and as `MDP.from_successors`.
       ImportError: for an id, if Gymnasium is not installed.
@@ -72,23 +78,38 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
             return from_gymnasium(env, discount=discount, features=features, initial=initial, end_state=end_state)
         finally:
             env.close()
-    next_state, probability, outcome_reward, terminated = _table(env)
+    next_state, probability, outcome_reward, terminated, allowed = _table(env)
+    _require_same_steps(env)
     initial = _initial(env, initial, len(next_state))
     reward = np.sum(probability * outcome_reward, axis=-1)
     if end_state:
         next_state = np.where(terminated, len(next_state), next_state)
         next_state, probability, reward = (_with_row(array) for array in (next_state, probability, reward))
+        allowed = np.concatenate([allowed, np.ones_like(allowed[:1])])
         terminal = np.arange(len(next_state)) == len(next_state) - 1
         initial = np.append(initial, 0.0)
         features = None if features is None else _with_row(_state_features(features, len(initial) - 1))
     else:
         terminal = np.zeros(len(next_state), bool)
         terminal[next_state[terminated]] = True
+        ends = ~allowed.any(axis=1)  # states without a row: nothing goes on there
+        starts = np.flatnonzero(ends & (initial > 0))
+        if starts.size:
+            raise ValueError(f"sum of P: probability[{starts[0]}, 0] must be 1, got 0.0: episodes start there")
+        terminal |= ends
         _require_ends(next_state, probability, terminated, terminal, initial)
     reward[terminal] = 0.0
     next_state[terminal] = np.flatnonzero(terminal)[:, None, None]
     probability[terminal] = np.arange(probability.shape[-1]) == 0
-    mdp = MDP.from_successors(next_state, probability, discount=discount, initial=initial, features=features)
+    allowed[terminal] = True
+    mdp = MDP.from_successors(
+        next_state,
+        probability,
+        discount=discount,
+        initial=initial,
+        features=features,
+        allowed=None if allowed.all() else allowed,
+    )
     reward = jnp.asarray(checks.require_floats_in(mdp.dtype, "expected reward", reward))
     return GymnasiumModel(mdp=mdp, reward=reward, terminal=jnp.asarray(terminal))
 
@@ -111,7 +132,7 @@ def make_environment(name: str, **options):
         import gymnasium
     except ImportError as error:
         raise ImportError(
-            f"making {name!r} needs gymnasium, which is not installed: pip install 'jaxhom[interop]'"
+            f"making {name!r} needs gymnasium, which is not installed: pip install '.[interop]'"
         ) from error
     try:
         with warnings.catch_warnings():
@@ -124,27 +145,28 @@ def make_environment(name: str, **options):
     raise ValueError(f"environment {name!r} cannot be made: {reason}")
 
 
-def _table(env) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Next states, probabilities, rewards and terminations, each [S, A, N], padded with probability 0."""
+def _table(env) -> tuple[np.ndarray, ...]:
+    """Next states, probabilities, rewards and terminations, [S, A, N], padded with 0; and `allowed` [S, A]."""
     table = getattr(getattr(env, "unwrapped", env), "P", None)
     if table is None:
         raise ValueError(
             f"{_name(env)} has no transition table P: record transitions in it, and estimate a model with "
             "jaxhom.interop.from_samples"
         )
-    entries = _entries(_rows(table, _name(env)))
+    entries, allowed = _entries(_rows(table, _name(env)))
     probability, next_state, reward, terminated = np.moveaxis(entries, -1, 0)
-    probability = checks.require_distribution("P: probability", probability)
+    probability = checks.require_distribution("P: probability", probability, None if allowed.all() else allowed)
     next_state = checks.require_integers("P: next state", next_state, upper=len(entries))
     reward = checks.require_floats("P: reward", reward)
-    return next_state, probability.copy(), reward, (terminated != 0) & (probability > 0)
+    return next_state, probability.copy(), reward, (terminated != 0) & (probability > 0), allowed
 
 
-def _entries(rows: list[list]) -> np.ndarray:
-    """The table's numbers, [S, A, N, 4], padded with zeros."""
+def _entries(rows: list[list]) -> tuple[np.ndarray, np.ndarray]:
+    """The table's numbers, [S, A, N, 4], padded with zeros, and which pairs have any, [S, A]."""
     width = max(1, max(len(outcomes) for row in rows for outcomes in row))
     checks.require_slots(len(rows), len(rows[0]), width)
     entries = np.zeros((len(rows), len(rows[0]), width, 4))
+    allowed = np.array([[len(outcomes) > 0 for outcomes in row] for row in rows])
     for s, row in enumerate(rows):
         for a, outcomes in enumerate(row):
             for i, outcome in enumerate(outcomes):
@@ -155,15 +177,18 @@ def _entries(rows: list[list]) -> np.ndarray:
                     expected = "(probability, next state, reward, terminated)"
                     got = checks.in_one_line(outcome)
                     raise ValueError(f"P[{s}][{a}][{i}] must be {expected}, got {got}") from None
-    return entries
+    return entries, allowed
 
 
 def _rows(table, name: str) -> list[list]:
-    """The table as nested lists, whatever it is kept in: states 0 ... S-1, each with actions 0 ... A-1."""
+    """The table as nested lists, whatever it is kept in: states 0 ... S-1, each with actions 0 ... A-1.
+
+    Where a state lacks an action (a dictionary without it, or no outcomes), its list is empty.
+    """
     try:
         num_states = len(table)
-        num_actions = len(table[0]) if num_states else 0
-        rows = [[list(table[s][a]) for a in range(len(table[s]))] for s in range(num_states)]
+        num_actions = max((_num_actions(table[s]) for s in range(num_states)), default=0)
+        rows = [[list(_outcomes(table[s], a)) for a in range(_num_actions(table[s]))] for s in range(num_states)]
     except (TypeError, KeyError, IndexError) as error:
         raise ValueError(
             f"P of {name} must hold a list of outcomes as P[state][action], both numbered from 0: "
@@ -171,10 +196,27 @@ def _rows(table, name: str) -> list[list]:
         ) from None
     if not num_states or not num_actions:
         raise ValueError(f"P of {name} must have at least one state and one action")
-    for s, row in enumerate(rows):
-        if len(row) != num_actions:
-            raise ValueError(f"P[{s}] has {len(row)} actions, but P[0] has {num_actions}: all states need the same")
-    return rows
+    return [row + [[] for _ in range(num_actions - len(row))] for row in rows]
+
+
+def _num_actions(actions) -> int:
+    """The actions of one state: up to the largest number in a dictionary."""
+    return max(actions, default=-1) + 1 if isinstance(actions, Mapping) else len(actions)
+
+
+def _outcomes(actions, action: int):
+    return actions.get(action, ()) if isinstance(actions, Mapping) else actions[action]
+
+
+def _require_same_steps(env) -> None:
+    """Raises where an option makes the environment do what its table does not say (Taxi's fickle passenger)."""
+    given = getattr(getattr(env, "spec", None), "kwargs", {})
+    for option in _OUTSIDE_THE_TABLE:
+        if given.get(option) or getattr(getattr(env, "unwrapped", env), option, False):
+            raise ValueError(
+                f"{_name(env)} was made with {option}=True, which its table P does not contain: make it without, or "
+                "record transitions and estimate a model with jaxhom.interop.from_samples"
+            )
 
 
 def _name(env) -> str:

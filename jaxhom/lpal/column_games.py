@@ -22,15 +22,15 @@ def capacities(num_features: int) -> list[int]:
     return sorted({max(_FIRST_CAPACITY, times * enough) for times in (0, 2, 4)})
 
 
-def play(payoffs: list[np.ndarray], former, bounds, tolerance: float, share: float, width: int) -> GameSolution:
+def play(payoffs: list[np.ndarray], former, bounds, tolerance, share: float, width: int) -> GameSolution:
     """Solves games, loosely where much is open.
 
     Args:
       payoffs: one [K, m] per game, m at most the largest of `capacities`; it may differ between games.
       former: (w [K], q [m]) per game, where to begin; zeros for nowhere.
       bounds: bounds on the values of the games over all policies.
-      tolerance, share: a game is solved when its own gap is below the tolerance, or below this share of what is open
-        between its lower bound and `bounds`.
+      tolerance, share: a game is solved when its own gap is below its tolerance (one for all, or one per game), or
+        below this share of what is open between its lower bound and `bounds`.
       width: games that are solved at a time, at least as many as there are: it decides which programs are compiled.
 
     Returns:
@@ -47,16 +47,18 @@ def play(payoffs: list[np.ndarray], former, bounds, tolerance: float, share: flo
         count = payoff.shape[1]
         stacked[k, :, :count], is_column[k] = payoff, np.arange(capacity) < count
         start[0][k], start[1][k, :count], bound[k] = w, q, bounds[k]
+    goal = np.ones(width, dtype)
+    goal[: len(payoffs)] = tolerance
     solve = _by_interior_point if min(num_features, capacity) <= _MAX_NEWTON_SIZE else _by_pdhg
-    return jax.tree.map(np.asarray, solve(stacked, is_column, bound, start, tolerance, share))
+    return jax.tree.map(np.asarray, solve(stacked, is_column, bound, start, goal, share))
 
 
 @jax.jit
 def _by_interior_point(payoff, is_column, bound, start, tolerance, share) -> GameSolution:
-    def solve(payoff, is_column, bound, start):
+    def solve(payoff, is_column, bound, start, tolerance):
         return solve_game(payoff, is_column, tolerance=tolerance, share=share, bound=bound, start=start)
 
-    return jax.vmap(solve)(payoff, is_column, bound, start)
+    return jax.vmap(solve)(payoff, is_column, bound, start, tolerance)
 
 
 @jax.jit

@@ -8,19 +8,31 @@ shares nothing with the columns but the certificate. Every few hundred iteration
 (eq. 5) and their true margins computed, the weights are bounded by planning, and the loop ends when those two meet.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom.lpal.certificate import LPALSolution, UpperBound, better_bound, bound_by_planning, certify
+from jaxhom.lpal.certificate import (
+    Found,
+    LPALSolution,
+    UpperBound,
+    better_bound,
+    bound_by_planning,
+    policy_from_occupancy,
+)
 from jaxhom.lpal.flow_factor import factor_flow
-from jaxhom.mdp import MDP
+from jaxhom.mdp import MDP, uniform_policy
 from jaxhom.occupancy import occupancy
-from jaxhom.pdhg import Status, engine
+from jaxhom.pdhg import engine
 from jaxhom.pdhg.flow_lp import FlowProblem
+from jaxhom.status import Status
 
-_STEPS_PER_CERTIFICATE = 16  # of engine.STEPS_PER_CHECK iterations each
+DEFAULT_ITERATIONS = 20_000
+_STEPS_PER_LOOK = 16  # of engine.STEPS_PER_CHECK iterations each
+_LOOKS_PER_CERTIFICATE = 8
 _FIRST_WEIGHT = 0.1
 _WEIGHT_RANGE = (0.01, 3.0)  # times the ratio of the dual to the primal point's length
 # An action that loses more than this share of the largest reward is left out of a policy.
@@ -29,43 +41,71 @@ _CLEAR_LOSSES = (float("inf"), 1e-2, 1e-4)
 
 def solve_by_flow(
     mdp: MDP,
-    expectations: jax.Array,
-    initial_policy: jax.Array | None,
-    tolerance: float,
+    expectations: np.ndarray,
+    initial_policy: np.ndarray | None,
+    tolerance: np.ndarray,
+    certify: Callable[[Found], LPALSolution],
     *,
-    max_iterations: int = 20_000,
+    max_iterations: int | None = None,
     progress: bool = False,
 ) -> LPALSolution:
     """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None."""
+    limit = DEFAULT_ITERATIONS if max_iterations is None else max_iterations
+    expectations, tolerance = jnp.asarray(expectations, mdp.dtype), jnp.asarray(tolerance, mdp.dtype)
     problem = _make_problem(mdp, expectations)
-    if initial_policy is None:
-        shape = (len(expectations), mdp.num_states, mdp.num_actions)
-        initial_policy = jnp.full(shape, 1.0 / mdp.num_actions, mdp.dtype)
-    state = _start(problem, initial_policy)
+    first = uniform_policy(mdp) if initial_policy is None else jnp.asarray(initial_policy, mdp.dtype)
+    state = _start(problem, jnp.broadcast_to(first, (len(expectations), mdp.num_states, mdp.num_actions)))
     bound = best = None
     value = jnp.zeros((len(expectations), mdp.num_states), mdp.dtype)
-    done = 0
-    with tqdm(disable=not progress, desc="LPAL", unit="iteration", total=max_iterations) as bar:
+    done = looks = 0
+    with tqdm(disable=not progress, desc="LPAL", unit="iteration", total=limit) as bar:
         while True:
-            bound, value, solution = _certify(problem, expectations, state, bound, value, tolerance, done)
+            bound, value, solution = _look(problem, expectations, state, bound, value, tolerance, done)
             best = solution if best is None else _better(best, solution, tolerance)
             bar.set_postfix(gap=f"{float((best.margin_bound - best.margin).max()):.2e}")
-            if (best.status == Status.SOLVED).all() or done >= max_iterations:
-                return best
-            state = _advance(problem, state)
-            done += _STEPS_PER_CERTIFICATE * engine.STEPS_PER_CHECK
-            bar.update(_STEPS_PER_CERTIFICATE * engine.STEPS_PER_CHECK)
+            if (best.status == Status.SOLVED).all() or done >= limit:
+                return certify(_found(best))
+            looks += 1
+            # The certificate has digits that looks in a short type, or at features far from 0, have not.
+            if looks % (1 if mdp.dtype != jnp.float64 else _LOOKS_PER_CERTIFICATE) == 0:
+                solution = certify(_found(best))
+                if (solution.status == Status.SOLVED).all():
+                    return solution
+            steps = min(_STEPS_PER_LOOK, -(-(limit - done) // engine.STEPS_PER_CHECK))
+            state = _advance(problem, state, steps)
+            done += steps * engine.STEPS_PER_CHECK
+            bar.update(steps * engine.STEPS_PER_CHECK)
+
+
+def _found(best: LPALSolution) -> Found:
+    host = jax.tree.map(np.asarray, best)
+    stopped = np.where(host.status == Status.SOLVED, Status.STALLED, Status.ITERATION_LIMIT)
+    return Found(x=host.policy, weights=host.weights, iterations=host.iterations, stopped=stopped, negligible=0.0)
 
 
 def _make_problem(mdp: MDP, expectations: jax.Array) -> FlowProblem:
-    features = np.asarray(mdp.features)
-    scale = np.abs(features).max() or 1.0
-    scaled = features / scale
+    features = np.asarray(mdp.features, np.float64)
+    unit = _units(np.abs(features).max(axis=(0, 1)))
+    scaled = features / unit
     projection = factor_flow(mdp, scaled)
     if (features == features[:, :1]).all():
         scaled = scaled[:, :1]
-    expected = (1.0 - mdp.discount) / scale * expectations.T
-    return FlowProblem(mdp=mdp, features=jnp.asarray(scaled), expectations=expected, projection=projection)
+    expected = (1.0 - mdp.discount) / jnp.asarray(unit, mdp.dtype)[:, None] * expectations.T
+    return FlowProblem(
+        mdp=mdp,
+        features=jnp.asarray(scaled, mdp.dtype),
+        expectations=expected,
+        projection=projection,
+        share=None if (unit == unit[0]).all() else jnp.asarray(unit.min() / unit, mdp.dtype),
+    )
+
+
+def _units(size: np.ndarray) -> np.ndarray:
+    """c [K]: one unit for features of sizes [K] that hardly differ, and for those that do one a power of 16 smaller."""
+    largest = size.max() or 1.0
+    with np.errstate(divide="ignore"):
+        smaller = np.floor(np.log2(largest / np.where(size > 0, size, largest)) / 4.0)
+    return largest * 16.0**-smaller
 
 
 @jax.jit
@@ -77,18 +117,18 @@ def _start(problem: FlowProblem, initial_policy: jax.Array) -> engine.PDHGState:
 
 
 @jax.jit
-def _advance(problem: FlowProblem, state: engine.PDHGState) -> engine.PDHGState:
+def _advance(problem: FlowProblem, state: engine.PDHGState, steps=_STEPS_PER_LOOK) -> engine.PDHGState:
     def step(_, state):
         state = engine.step(problem, state)
         # Where one side has arrived, the engine's rule gives all weight to the other and never takes it back.
         ratio = jnp.linalg.norm(state.dual, axis=0) / jnp.linalg.norm(state.primal, axis=0)
         return state.replace(weight=jnp.clip(state.weight, *(ratio * factor for factor in _WEIGHT_RANGE)))
 
-    return jax.lax.fori_loop(0, _STEPS_PER_CERTIFICATE, step, state)
+    return jax.lax.fori_loop(0, steps, step, state)
 
 
 @jax.jit
-def _certify(problem, expectations, state, bound: UpperBound | None, value, tolerance, iterations):
+def _look(problem, expectations, state, bound: UpperBound | None, value, tolerance, iterations):
     """The best bound so far, the value function of the newest weights, and the best policy that the state suggests."""
     mdp = problem.mdp
     new_bound, plan = bound_by_planning(mdp, expectations, problem.weights(state.primal).T, value, tolerance)
@@ -100,12 +140,30 @@ def _certify(problem, expectations, state, bound: UpperBound | None, value, tole
     candidates = [jnp.zeros_like(loss)]  # nothing is left: the plan's own policy
     candidates += [jnp.where(loss <= share * scale, x, 0.0) for x in readings for share in _CLEAR_LOSSES]
     count, lanes = len(candidates), len(expectations)
-    repeated, of_all = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * count), (expectations, bound))
-    x = jnp.concatenate(candidates)
-    solution = certify(mdp, repeated, x, of_all, tolerance, iterations, stopped=Status.ITERATION_LIMIT)
+    given = (expectations, bound, tolerance)
+    repeated, of_all, goals = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * count), given)
+    solution = _solution(mdp, repeated, jnp.concatenate(candidates), of_all, goals, iterations)
     solution = jax.tree.map(lambda leaf: leaf.reshape(count, lanes, *leaf.shape[1:]), solution)
     best = solution.margin.argmax(axis=0)
     return bound, plan.value, jax.tree.map(lambda leaf: leaf[best, jnp.arange(lanes)], solution)
+
+
+def _solution(mdp, expectations, x, bound: UpperBound, tolerance, iterations) -> LPALSolution:
+    """The solution whose policy is read off the occupancy x [B, S, A], as good as the model's type."""
+    policy = policy_from_occupancy(mdp, x, bound.policy)
+    true_occupancy = occupancy(mdp, policy)
+    margin = (jnp.einsum("bsa,sak->bk", true_occupancy, mdp.features) - expectations).min(axis=-1)
+    margin = jnp.where(jnp.isfinite(margin), margin, -jnp.inf)
+    is_closed = bound.margin_bound - margin <= tolerance
+    return LPALSolution(
+        policy=policy,
+        occupancy=true_occupancy,
+        margin=margin,
+        margin_bound=bound.margin_bound,
+        weights=bound.weights,
+        iterations=jnp.broadcast_to(jnp.asarray(iterations, jnp.int32), margin.shape),
+        status=jnp.where(is_closed, Status.SOLVED, Status.ITERATION_LIMIT).astype(jnp.int32),
+    )
 
 
 @jax.jit

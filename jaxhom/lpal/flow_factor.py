@@ -9,6 +9,7 @@ from jaxhom.mdp import MDP
 from jaxhom.normal_equations import flow_matrix
 from jaxhom.pdhg.flow_lp import FEATURE_SCALE, FlowProjection
 
+_REGULARISATIONS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)  # shares of the diagonal, to be tried in turn
 _MAX_ENTRIES = 2**28  # of the factor: 2 GB in float64
 
 
@@ -22,7 +23,7 @@ def factor_flow(mdp: MDP, features: np.ndarray) -> FlowProjection:
     Raises:
       ValueError: if the factor would take more than 2 GB.
     """
-    flow, phi = flow_matrix(mdp), np.asarray(features, float).reshape(-1, features.shape[-1])
+    flow, phi = flow_matrix(mdp), np.asarray(features, float).reshape(-1, features.shape[-1])  # 0 where not allowed
     if mdp.is_dense:  # a sparse product of full matrices takes seconds
         flow = flow.toarray()
     normal, cross = scipy.sparse.csr_array(flow @ flow.T), flow @ phi
@@ -33,7 +34,7 @@ def factor_flow(mdp: MDP, features: np.ndarray) -> FlowProjection:
             f"method='flow' needs a factor of {entries:.1e} entries for this model of {mdp.num_states} states, "
             f"more than {_MAX_ENTRIES:.1e}: use method='columns'"
         )
-    factor = BlockCholesky(normal, blocks)
+    factor = _factor(normal, blocks)
     behind = factor.solve(cross)
     schur = phi.T @ phi + FEATURE_SCALE**2 * np.eye(phi.shape[1]) - cross.T @ behind
     padding = np.full(blocks.count * blocks.size - len(blocks.order), mdp.num_states)
@@ -44,3 +45,13 @@ def factor_flow(mdp: MDP, features: np.ndarray) -> FlowProjection:
         place=jnp.asarray(blocks.place, jnp.int32),
         **{name: jnp.asarray(array, mdp.dtype) for name, array in arrays.items()},
     )
+
+
+def _factor(normal, blocks) -> BlockCholesky:
+    """With as little regularisation as rounding asks for: certificates do not need exact projections."""
+    for share in _REGULARISATIONS:
+        try:
+            return BlockCholesky(normal, blocks, share)
+        except np.linalg.LinAlgError:
+            continue
+    return BlockCholesky(normal, blocks, 1.0)

@@ -12,12 +12,13 @@ class PolicyPool:
     """Policies with their occupancies and feature expectations.
 
     Deterministic policies are kept as actions, and every occupancy as that of the states: S numbers and S actions.
+    Sums of them are float64, whatever the model's type.
     """
 
     def __init__(self, mdp: MDP):
         self._num_actions, self._dtype = mdp.num_actions, np.dtype(mdp.dtype)
         self._action_dtype = np.min_scalar_type(mdp.num_actions - 1)
-        self._expected = np.zeros((_FIRST_SIZE, mdp.num_features), self._dtype)
+        self._expected = np.zeros((_FIRST_SIZE, mdp.num_features))
         self._policies: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
@@ -27,7 +28,7 @@ class PolicyPool:
 
     def add(self, occupancy: np.ndarray, policy: np.ndarray, expected: np.ndarray) -> int:
         """Takes a policy, given by actions [S] or probabilities [S, A], with mu [S] and V [K]; returns its number."""
-        policy = policy.astype(self._action_dtype if policy.ndim == 1 else self._dtype)
+        policy = policy.astype(self._action_dtype) if policy.ndim == 1 else policy
         number = len(self._policies)
         if number == len(self._expected):
             self._expected = np.concatenate([self._expected, np.zeros_like(self._expected)])
@@ -38,7 +39,7 @@ class PolicyPool:
     def mixture(self, numbers: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         """The occupancy sum_j q_j x_j [S, A] of policies mixed with the given probabilities."""
         states = np.arange(len(self._policies[0][0]))
-        x = np.zeros((len(states), self._num_actions), self._dtype)
+        x = np.zeros((len(states), self._num_actions))
         for number, probability in zip(numbers, probabilities, strict=True):
             mu, policy = self._policies[number]
             if policy.ndim == 1:

@@ -15,45 +15,58 @@ import numpy as np
 
 from jaxhom.lpal import interior_point
 from jaxhom.lpal.certificate import LPALSolution
-from jaxhom.lpal.columns import solve_by_columns
+from jaxhom.lpal.columns import DEFAULT_COLUMNS, solve_by_columns
 from jaxhom.mdp import MDP
-from jaxhom.pdhg import Status
+from jaxhom.status import Status
 
 _MANY_FEATURES = 16
 _SMALL, _MEDIUM, _LARGE = 2e6, 3e7, 3e9  # multiplications of a step
 _SMALL_STATES = 1024  # more make no small step
-_MAX_STEPS = 50  # where columns have begun
 
 
 def solve_by_the_quickest(
     mdp: MDP,
-    expectations: jax.Array,
-    initial_policy: jax.Array | None,
-    tolerance: float,
+    expectations: np.ndarray,
+    initial_policy: np.ndarray | None,
+    tolerance: np.ndarray,
+    certify: Callable[..., LPALSolution],
     *,
-    initial_weights: jax.Array | None = None,
+    initial_weights: np.ndarray | None = None,
     max_iterations: int | None = None,
     progress: bool = False,
 ) -> LPALSolution:
-    """`lpal` on a batch: expectations [B, K]. What is given to begin with is for columns, and a limit too."""
-    limit = {} if max_iterations is None else {"max_iterations": max_iterations}
-    by_columns = functools.partial(solve_by_columns, mdp, progress=progress, **limit)
+    """`lpal` on a batch: expectations [B, K]. What is given to begin with is for columns; both count for a limit."""
+    limit = DEFAULT_COLUMNS if max_iterations is None else max_iterations
+    by_columns = functools.partial(solve_by_columns, mdp, max_iterations=limit, progress=progress)
     program = functools.cache(functools.partial(interior_point.Program, mdp))
-    is_for_columns = mdp.is_dense or mdp.dtype != jnp.float64 or mdp.num_features < _MANY_FEATURES
-    if is_for_columns or max_iterations is not None:  # a limit counts columns
-        return by_columns(expectations, initial_policy, tolerance, initial_weights=initial_weights)
+    if mdp.is_dense or mdp.dtype != jnp.float64 or mdp.num_features < _MANY_FEATURES:
+        return by_columns(expectations, initial_policy, tolerance, certify, initial_weights=initial_weights)
     is_guided = initial_policy is not None or initial_weights is not None
     if is_guided or not _is_small(mdp, program):
-        helper = functools.cache(functools.partial(_helper, program, tolerance))
-        return by_columns(expectations, initial_policy, tolerance, initial_weights=initial_weights, helper=helper)
-    solution = interior_point.solve_by_interior_point(
-        mdp, expectations, None, tolerance, progress=progress, program=program()
-    )
-    left = np.flatnonzero(np.asarray(solution.status) != Status.SOLVED)
+        helper = functools.cache(functools.partial(_helper, program))
+        guesses = {"initial_weights": initial_weights, "helper": helper}
+        return by_columns(expectations, initial_policy, tolerance, certify, **guesses)
+    steps = min(limit, interior_point.DEFAULT_STEPS)
+    options = {"max_iterations": steps, "progress": progress, "program": program()}
+    solution = interior_point.solve_by_interior_point(mdp, expectations, None, tolerance, certify, **options)
+    left = np.flatnonzero((solution.status != Status.SOLVED) & (solution.iterations < limit))
     if not left.size:
         return solution
-    rest = by_columns(expectations[left], solution.policy[left], tolerance, initial_weights=solution.weights[left])
-    return jax.tree.map(lambda all_lanes, lanes: jnp.asarray(all_lanes).at[left].set(lanes), solution, rest)
+    rest = by_columns(
+        expectations[left],
+        solution.policy[left],
+        tolerance[left],
+        functools.partial(certify, lanes=left),
+        initial_weights=solution.weights[left],
+        spent=solution.iterations[left],
+    )
+    return jax.tree.map(lambda all_lanes, lanes: _with_lanes(all_lanes, left, lanes), solution, rest)
+
+
+def _with_lanes(array: np.ndarray, lanes: np.ndarray, new: np.ndarray) -> np.ndarray:
+    array = array.copy()
+    array[lanes] = new
+    return array
 
 
 def _is_small(mdp: MDP, program: Callable) -> bool:
@@ -63,10 +76,9 @@ def _is_small(mdp: MDP, program: Callable) -> bool:
     return program().work <= _SMALL
 
 
-def _helper(program: Callable, tolerance: float):
+def _helper(program: Callable):
     """The interior point for lanes at rest, or for every second where columns take as long; None if it is no match."""
     work = program().work
     if work > _LARGE:
         return None
-    solve = functools.partial(program().solve, tolerance=tolerance, max_iterations=_MAX_STEPS)
-    return solve, 1 if work <= _MEDIUM else 2
+    return program().solve, 1 if work <= _MEDIUM else 2

@@ -1,19 +1,21 @@
 """Best responses of LPAL on columns: the policy that is worth most for given weights, and its feature expectations."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.lpal.certificate import bound_by_planning
+from jaxhom.chain_solver import rough_state_occupancy
+from jaxhom.lpal.certificate import bound_by_planning, simplex_point
+from jaxhom.lpal.exact import Exact, compact_features, exact_rows
 from jaxhom.mdp import MDP
-from jaxhom.occupancy import rough_state_occupancy
 
 
 def with_compact_features(mdp: MDP) -> MDP:
     """The model with features [S, 1, K] where they do not depend on the action: a quarter of the numbers, with four."""
-    features = np.asarray(mdp.features)
-    depends = (features != features[:, :1]).any()
-    return mdp if depends else mdp.replace(features=jnp.asarray(features[:, :1]))
+    features = compact_features(np.asarray(mdp.features), np.asarray(mdp.allowed))
+    return mdp if features.shape[1] > 1 else dataclasses.replace(mdp, features=jnp.asarray(features))
 
 
 @jax.jit
@@ -58,3 +60,24 @@ def _expected_features(mdp, policy, error):
     if mdp.features.shape[1] == 1:
         return mu, mu.T @ mdp.features[:, 0]
     return mu, jnp.einsum("sl,lsa,sak->lk", mu, policy, mdp.features)
+
+
+def respond_on_host(exact: Exact, expectations, weights, value, accuracy: float, error: float) -> dict[str, np.ndarray]:
+    """`respond` for one lane, without its axis, by linear solves in float64: right at any discount, in any type."""
+    weights = simplex_point(weights)
+    best, value, actions = exact.plan(weights, value, None, accuracy)
+    mu, expected = evaluate_on_host(exact, np.eye(exact.allowed.shape[1])[actions], error)
+    return {
+        "weights": weights,
+        "margin_bound": np.float64(best - weights @ expectations),
+        "value": value,
+        "actions": actions,
+        "occupancy": mu,
+        "expected": expected,
+    }
+
+
+def evaluate_on_host(exact: Exact, policy: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
+    """`evaluate` likewise."""
+    mu, expected, _ = exact.expectations(exact_rows(policy, np.float64), None, error)
+    return mu, expected

@@ -19,7 +19,6 @@ every lane has its own anchor, weight, restarts and bounds. Answers are certific
 bound, any feasible y a lower one, and the best of each are kept with the points that prove them.
 """
 
-import enum
 from typing import Protocol
 
 import chex
@@ -35,29 +34,6 @@ _ARTIFICIAL_FRACTION = 0.36  # restart when the round is this fraction of all st
 _MAX_WEIGHT_CHANGE = 8.0  # per restart
 _MAX_WEIGHT = 1e4
 STEPS_PER_CHECK = 16
-
-
-class Status(enum.IntEnum):
-    """How a lane ended. Bounds are valid whatever the status."""
-
-    SOLVED = 0
-    ITERATION_LIMIT = 1
-    STALLED = 2
-
-    @property
-    def message(self) -> str:
-        """What happened, and what to do about it."""
-        return {
-            Status.SOLVED: "the bounds are as close as asked for",
-            Status.ITERATION_LIMIT: (
-                "the iteration limit came first: the bounds hold but are further apart than asked for; "
-                "raise max_iterations or tolerance"
-            ),
-            Status.STALLED: (
-                "rounding stopped progress before the tolerance was reached: the bounds hold; "
-                "work in float64 (jax_enable_x64) or raise tolerance"
-            ),
-        }[self]
 
 
 class Problem(Protocol):

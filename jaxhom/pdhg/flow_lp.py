@@ -10,8 +10,9 @@ with multipliers lambda of x >= 0 and q = s w, w the weights of the upper bound.
 on it is Douglas-Rachford splitting (O'Connor and Vandenberghe 2020), its step length 1 whatever the discount: that F is
 nearly singular for discounts near 1 only concerns the projection on A, which is exact (`FlowProjection`).
 
-Features are scaled to at most 1 and x to sum 1. The primal point is lambda and q stacked, [S A + K, lanes], the dual
-one x and u.
+x is scaled to sum 1, and features to about 1, each by a unit c_i of its own where their sizes differ: then q_i = s w_i
+c_i / min c, and the simplex is sum_i q_i min c / c_i = s. Pairs that are not allowed have x = 0 and no multiplier. The
+primal point is lambda and q stacked, [S A + K, lanes], the dual one x and u.
 """
 
 import chex
@@ -82,21 +83,24 @@ class FlowProblem:
 
     Attributes:
       mdp: the model.
-      features: [S, A, K], or [S, 1, K] where they are those of the state alone; largest entry 1.
-      expectations: [K, lanes], (1 - gamma) Vhat in the unit of `features`.
+      features: [S, A, K], or [S, 1, K] where they are those of the state alone; in units of their own.
+      expectations: [K, lanes], (1 - gamma) Vhat in the units of `features`.
       projection: the factorisation for these features.
+      share: [K], min c / c_i: what a feature's part of q counts for in the simplex. None where all are 1.
     """
 
     mdp: MDP
     features: jax.Array
     expectations: jax.Array
     projection: FlowProjection
+    share: jax.Array | None = None
 
     def start(self) -> tuple[jax.Array, jax.Array]:
         """No multipliers, uniform weights; the point of the affine set next to the uniform x."""
         (num_features, lanes), pairs = self.expectations.shape, self.mdp.num_states * self.mdp.num_actions
         x = jnp.full((self.mdp.num_states, self.mdp.num_actions, lanes), 1.0 / pairs, self.mdp.dtype)
-        q = jnp.full((num_features, lanes), FEATURE_SCALE / num_features, x.dtype)
+        x = self._allowed(x)
+        q = self._project_weights(jnp.full((num_features, lanes), FEATURE_SCALE / num_features, x.dtype))
         return jnp.concatenate([jnp.zeros((pairs, lanes), x.dtype), q]), self.project_dual(self.dual_of(x), None)
 
     def dual_of(self, x: jax.Array) -> jax.Array:
@@ -114,7 +118,7 @@ class FlowProblem:
     def project_primal(self, point: jax.Array, step: jax.Array) -> jax.Array:
         """lambda >= 0; the step on the linear term -q . Vhat / s, then q onto the simplex of sum s."""
         multipliers, q = self._split(point)
-        q = project_simplex(q + step * (self.expectations / FEATURE_SCALE), FEATURE_SCALE)
+        q = self._project_weights(q + step * (self.expectations / FEATURE_SCALE))
         return jnp.concatenate([jnp.maximum(multipliers, 0.0), q])
 
     def project_dual(self, point: jax.Array, step) -> jax.Array:
@@ -122,13 +126,13 @@ class FlowProblem:
         del step
         mdp = self.mdp
         x, u = self._split(point)
-        x = x.reshape(mdp.num_states, mdp.num_actions, -1)
+        x = self._allowed(x.reshape(mdp.num_states, mdp.num_actions, -1))
         initial = (1.0 - mdp.discount) * mdp.initial[:, None]
         flow = x.sum(axis=1) - mdp.discount * push_forward(mdp, x) - initial
         on_flow, on_features = self.projection.solve(flow, self._expected(x) - FEATURE_SCALE * u)
         change = jnp.tensordot(self.features, on_features, axes=1)
         moved = [on_flow - mdp.discount * value for value in expected_next_values(mdp, on_flow)]
-        x = x - change - jnp.stack(moved, axis=1)
+        x = self._allowed(x - change - jnp.stack(moved, axis=1))
         return jnp.concatenate([x.reshape(-1, x.shape[-1]), u + FEATURE_SCALE * on_features])
 
     def bounds(self, primal, dual, forward, adjoint) -> tuple[jax.Array, jax.Array]:
@@ -144,7 +148,8 @@ class FlowProblem:
     def weights(self, primal: jax.Array) -> jax.Array:
         """w [K, lanes], in the simplex."""
         _, q = self._split(primal)
-        return project_simplex(q / FEATURE_SCALE)
+        q = q / FEATURE_SCALE
+        return project_simplex(q if self.share is None else q * self.share[:, None])
 
     def occupancies(self, primal: jax.Array, dual: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Two non-negative readings of x, [S, A, lanes]: on the flow up to clipping, and complementary to lambda."""
@@ -152,6 +157,16 @@ class FlowProblem:
         shape = (self.mdp.num_states, self.mdp.num_actions, -1)
         readings = jnp.maximum(x, 0.0), jnp.maximum(x - weight * multipliers, 0.0)
         return tuple(reading.reshape(shape) for reading in readings)
+
+    def _project_weights(self, point: jax.Array) -> jax.Array:
+        """q [K, lanes] onto its simplex."""
+        if self.share is None:
+            return project_simplex(point, FEATURE_SCALE)
+        return project_weighted_simplex(point, self.share, FEATURE_SCALE)
+
+    def _allowed(self, x: jax.Array) -> jax.Array:
+        """x [S, A, lanes] without what is not allowed."""
+        return jnp.where(self.mdp.allowed[..., None], x, 0.0) if self.mdp.restricts_actions else x
 
     def _split(self, stacked: jax.Array) -> tuple[jax.Array, jax.Array]:
         pairs = self.mdp.num_states * self.mdp.num_actions
@@ -162,3 +177,23 @@ class FlowProblem:
         if self.features.shape[1] == 1:
             x = x.sum(axis=1, keepdims=True)
         return jnp.tensordot(self.features, x, axes=((0, 1), (0, 1)))
+
+
+def project_weighted_simplex(point: jax.Array, share: jax.Array, total: float) -> jax.Array:
+    """argmin_q |q - point|^2 subject to q >= 0, share . q = total; [K, lanes], share [K] positive.
+
+    q = max(point - t share, 0), with t found from the values of t at which entries become 0.
+    """
+    share = share[:, None]
+    knots = point / share
+
+    def amount(t):
+        return (share * jnp.maximum(point - t * share, 0.0)).sum(axis=0)
+
+    # The mass falls with t: the last knot at which it is not yet below the total, and from there a straight line.
+    amounts = jax.lax.map(amount, knots)
+    reaches = jnp.where(amounts >= total, knots, -jnp.inf).max(axis=0)
+    is_active = knots > reaches
+    slope = jnp.where(is_active, share * share, 0.0).sum(axis=0)
+    t = (jnp.where(is_active, share * point, 0.0).sum(axis=0) - total) / jnp.maximum(slope, jnp.finfo(point.dtype).tiny)
+    return jnp.maximum(point - t * share, 0.0)

@@ -65,7 +65,7 @@ def learned_policy_figure(
     world = board_of(gridworld, Gridworld)
     reward = require("reward", reward, (world.num_states,), (world.num_states, len(world.moves)))
     arrows = policy_at(world, gridworld_policy, (0, 0))
-    gridworld_demonstrations.validate(world.mdp)
+    gridworld_demonstrations.validate(world.mdp, "ignore")
     visited, _ = empirical_policy(racetrack.mdp, racetrack_demonstrations)
     trials = {name: _median_trial(key, racetrack, policy, horizon) for name, policy in racetrack_policies.items()}
     left, right = _two_halves(board_of(racetrack, Racetrack), len(trials))

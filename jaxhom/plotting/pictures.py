@@ -157,7 +157,7 @@ def plot_trajectories(
       ValueError: if a state does not exist in the domain.
     """
     board = board_of(domain)
-    trajectories.validate(board.mdp)
+    trajectories.validate(board.mdp, "ignore")
     ax = ground(board, ax) if ax is None else ax
     num = trajectories.num_trajectories
     offset = _SPREAD * (np.arange(num) - (num - 1) / 2) / max(num - 1, 1)
@@ -217,7 +217,7 @@ def _plot_domain(board, values, label, visited, trajectories, policy, speed, ax)
     if visited is not None:
         visited = require("visited", visited, (board.num_states,)) > 0
     if trajectories is not None:
-        trajectories.validate(board.mdp)
+        trajectories.validate(board.mdp, "ignore")
     if policy is not None:
         policy = policy_at(board, policy, speed)
     ax = ground(board, ax, BAR_ROOM * (values is not None))

@@ -22,7 +22,7 @@ from jaxhom.domains import Racetrack, TileMap, racetrack
 from jaxhom.domains.track_maps import SHIPPED
 from jaxhom.impossible_steps import ImpossibleStepsWarning
 from jaxhom.interop.environment_maps import tile_map
-from jaxhom.interop.environments import from_gymnasium, make_environment
+from jaxhom.interop.environments import from_gymnasium, make_environment, require_steps_of_table
 from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, load_mdp, load_policy
 from jaxhom.interop.trajectories import demonstrations_from_csv
 from jaxhom.mdp import MDP, absorbing_states
@@ -120,6 +120,7 @@ def _environment(options) -> Problem:
     try:
         discount = _DISCOUNT if options.discount is None else options.discount
         model = from_gymnasium(env, discount=discount, end_state=options.end_state)
+        require_steps_of_table(env)
         domain, limit = tile_map(env, model.mdp), env.spec.max_episode_steps or _STEPS
     except ValueError as error:
         raise ValueError(f"{name}: {str(error).replace('end_state=True', '--end-state')}") from None

@@ -15,7 +15,9 @@ there is `end_state=True`, where every terminated outcome leads to one further, 
 states of the environment stay as they are. That is right for every table.
 """
 
+import contextlib
 import dataclasses
+import inspect
 import warnings
 from collections.abc import Mapping
 
@@ -62,9 +64,9 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
 
     Raises:
       ValueError: if there is no such environment; if it has no table `P` or no initial distribution, or an option that
-        its table does not contain; naming the first
-        entry of the table that is malformed; naming a state in which some episodes end and others go on, unless
-        `end_state`; and as `MDP.from_successors`.
+        its table does not contain; naming the first entry of the table that is malformed; naming a state in which some
+        episodes end and others go on, unless `end_state`; for an id also if its steps are not those of its table
+        (`require_steps_of_table`); and as `MDP.from_successors`.
       ImportError: for an id, if Gymnasium is not installed.
 
     Example:
@@ -75,6 +77,7 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
     if isinstance(env, str):
         env = make_environment(env)
         try:
+            require_steps_of_table(env)
             return from_gymnasium(env, discount=discount, features=features, initial=initial, end_state=end_state)
         finally:
             env.close()
@@ -82,22 +85,19 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
     _require_same_steps(env)
     initial = _initial(env, initial, len(next_state))
     reward = np.sum(probability * outcome_reward, axis=-1)
+    has_rows = allowed.any(axis=1)  # elsewhere nothing goes on, however such a state was entered
+    message = "is positive, but P has no outcome there: no episode can start where nothing follows"
+    checks.require_all("initial", initial, has_rows | (initial == 0), message)
+    terminal = ~has_rows
     if end_state:
         next_state = np.where(terminated, len(next_state), next_state)
         next_state, probability, reward = (_with_row(array) for array in (next_state, probability, reward))
-        allowed = np.concatenate([allowed, np.ones_like(allowed[:1])])
-        terminal = np.arange(len(next_state)) == len(next_state) - 1
+        terminal, allowed = np.append(terminal, True), np.concatenate([allowed, np.ones_like(allowed[:1])])
         initial = np.append(initial, 0.0)
         features = None if features is None else _with_row(_state_features(features, len(initial) - 1))
     else:
-        terminal = np.zeros(len(next_state), bool)
         terminal[next_state[terminated]] = True
-        ends = ~allowed.any(axis=1)  # states without a row: nothing goes on there
-        starts = np.flatnonzero(ends & (initial > 0))
-        if starts.size:
-            raise ValueError(f"sum of P: probability[{starts[0]}, 0] must be 1, got 0.0: episodes start there")
-        terminal |= ends
-        _require_ends(next_state, probability, terminated, terminal, initial)
+        _require_ends(next_state, probability, terminated, terminal & has_rows, initial)
     reward[terminal] = 0.0
     next_state[terminal] = np.flatnonzero(terminal)[:, None, None]
     probability[terminal] = np.arange(probability.shape[-1]) == 0
@@ -125,7 +125,8 @@ def make_environment(name: str, **options):
       The environment.
 
     Raises:
-      ValueError: if there is no such environment, or it refuses the options.
+      ValueError: if there is no such environment, it lacks an option, one that is on or off is given something else
+        (a text would count as on, whatever it says), or it refuses the options.
       ImportError: if Gymnasium is not installed.
     """
     try:
@@ -137,12 +138,95 @@ def make_environment(name: str, **options):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # the version is the caller's choice
+            _require_options(gymnasium, name, options)
             return gymnasium.make(name, **options)
     except gymnasium.error.Error as error:
         reason = str(error).partition("\n")[0]
+    except _OptionError as error:
+        raise ValueError(f"environment {name!r}: {error}") from None
     except Exception as error:  # constructors raise what they come upon
-        reason = f"{type(error).__name__} {checks.in_one_line(str(error))}"
-    raise ValueError(f"environment {name!r} cannot be made: {reason}")
+        reason = f"{type(error).__name__} {' '.join(str(error).split())}"
+    given = f" with {', '.join(f'{key}={value!r}' for key, value in options.items())}" if options else ""
+    raise ValueError(f"environment {name!r} cannot be made{given}: {reason}")
+
+
+class _OptionError(ValueError):
+    """An option that an environment does not have, or that cannot mean what it says."""
+
+
+def _require_options(gymnasium, name: str, options: dict) -> None:
+    """Raises on an option that a constructor does not name, and on one that is on or off and neither."""
+    if not options:
+        return
+    known = _parameters(gymnasium.envs.registration.load_env_creator, gymnasium.spec(name).entry_point)
+    if known is None:
+        return
+    of_make = inspect.signature(gymnasium.make).parameters
+    for option, value in options.items():
+        if option not in known and option not in of_make:
+            raise _OptionError(f"it has no option {option!r}; it has {', '.join(known) or 'none'}")
+        default = known[option].default if option in known else None
+        if isinstance(default, bool) and not (isinstance(value, bool | np.bool_) or value in (0, 1)):
+            raise _OptionError(f"{option} must be true or false, got {value!r}")
+
+
+def _parameters(load, entry_point) -> dict | None:
+    """The named parameters of what makes an environment; None where they are not known, or any name will do."""
+    try:
+        parameters = inspect.signature(load(entry_point) if isinstance(entry_point, str) else entry_point).parameters
+    except (TypeError, ValueError):
+        return None
+    kinds = {parameter.kind for parameter in parameters.values()}
+    return None if inspect.Parameter.VAR_KEYWORD in kinds else dict(parameters)
+
+
+def require_steps_of_table(env, num_steps: int = 200) -> None:
+    """Takes random steps in an environment and raises if one is not in its table `P`.
+
+    An option or a wrapper may act in `step` alone, and then the table is not the model of what an agent meets. The
+    environment is reset and stepped: not for one in which an episode is under way.
+
+    Args:
+      env: the environment. Nothing is checked if it has no table, its observations are no states, or it cannot be
+        stepped.
+      num_steps: how many.
+
+    Raises:
+      ValueError: naming the first state, action and next state that the table gives no probability.
+    """
+    table, found = getattr(env.unwrapped, "P", None), None
+    with warnings.catch_warnings(), contextlib.suppress(Exception):  # the environment's own, whatever they are
+        warnings.simplefilter("ignore")
+        found = _step_outside(env, table, num_steps)
+    if found is not None:
+        state, action, successor = found
+        raise ValueError(
+            f"{_name(env)}: action {action} led from state {state} to {successor}, which its table P gives "
+            "probability 0: an option or a wrapper acts outside the table; make it without, or record "
+            "transitions and estimate a model with jaxhom.interop.from_samples"
+        )
+
+
+def _step_outside(env, table, num_steps: int) -> tuple | None:
+    """The first of some random steps that is not in the table: state, action, next state; None if all are."""
+    rng = np.random.default_rng(0)
+    state = env.reset(seed=0)[0]
+    for _ in range(num_steps):
+        actions = range(_num_actions(table[int(state)])) if _is_state(state, table) else ()
+        actions = [action for action in actions if len(_outcomes(table[int(state)], action))]
+        if not actions:
+            return None
+        action = actions[rng.integers(len(actions))]
+        successor, _, terminated, truncated, _ = env.step(action)
+        outcomes = _outcomes(table[int(state)], action)
+        if _is_state(successor, table) and not any(o[0] > 0 and o[1] == successor for o in outcomes):
+            return state, action, successor
+        state = env.reset()[0] if terminated or truncated else successor
+    return None
+
+
+def _is_state(observation, table) -> bool:
+    return np.ndim(observation) == 0 and np.asarray(observation).dtype.kind in "iu" and 0 <= observation < len(table)
 
 
 def _table(env) -> tuple[np.ndarray, ...]:

@@ -275,7 +275,9 @@ def _pdhg_lanes(problem) -> int:
     n, num_actions, m = *problem.source.shape[:2], problem.target.shape[0]
     entries = num_actions * (n * n + m * m + 6 * n * m) + 6 * n * m
     is_large = _FEW_PDHG_LANES * entries * problem.source.dtype.itemsize > _FEW_BYTES
-    most = _FEW_PDHG_LANES if is_large and problem.source.shape[-1] <= _FEW_PDHG_LANES else _MAX_LANES
+    most, count = _MAX_LANES, problem.source.shape[-1]
+    if is_large and count <= _FEW_PDHG_LANES:
+        most = 2 ** int(np.ceil(np.log2(count))) if n + m > MAX_INTERIOR_SIZE else _FEW_PDHG_LANES
     return _fitting_lanes(problem, entries, _BATCH_BYTES, most)
 
 

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxhom import checks
+from jaxhom.pdhg import engine
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
 
 with warnings.catch_warnings():
@@ -42,7 +43,7 @@ def homomorphism_map(
       anchored: require that the centre is mapped to the centre.
 
     Returns:
-      f [n, m], rows sum to 1. Works under `jit`, `vmap` and `grad`.
+      f [n, m], rows sum to 1; NaN where 100,000 iterations do not find it. Works under `jit`, `vmap` and `grad`.
 
     Raises:
       ValueError: if the shapes do not fit or `regularization` is not positive.
@@ -62,12 +63,14 @@ def _map(source, target, regularization, anchored):
     n, num_actions, _ = source.shape
     m = target.shape[0]
     size = n * m
-    # |K|_2 <= sqrt(|K|_1 |K|_inf) <= sqrt((A + A n) (1 + m)): a step that suits every pair of models of these shapes.
-    step = 0.99 / ((num_actions + num_actions * n) * (1.0 + m)) ** 0.5
-    shrink = 1.0 / (1.0 + step * regularization)
+    problem = _problem(jax.lax.stop_gradient(source), jax.lax.stop_gradient(target), anchored)
+    step = engine.init(problem).eta[0]  # just below 1 / |K|; the fixed point does not depend on it
+    eps = jnp.finfo(source.dtype).eps
 
-    def operator(z, models):
+    def operator(z, parameters):
         """PDHG with proximal steps on z, f and y stacked."""
+        *models, step = parameters
+        shrink = 1.0 / (1.0 + step * regularization)
         problem = _problem(*models, anchored)
         f, y = z[:size].reshape(n, m, 1), z[size:].reshape(n, num_actions, m, 1)
         moved = problem.project_primal(shrink * (f - step * problem.adjoint(y)), None)
@@ -75,8 +78,10 @@ def _map(source, target, regularization, anchored):
         return jnp.concatenate([moved.ravel(), climbed.ravel()])
 
     @implicit_diff.custom_fixed_point(operator, solve=linear_solve.solve_lu)
-    def solve(z, models):
-        tolerance = 32.0 * jnp.finfo(z.dtype).eps * step * regularization
+    def solve(z, parameters):
+        step = parameters[-1]
+        contraction = step * regularization  # the distance that is left is about the last change divided by this
+        tolerance = eps * jnp.maximum(32.0 * contraction, 0.125)
 
         def keep_going(state):
             _, change, count = state
@@ -84,13 +89,15 @@ def _map(source, target, regularization, anchored):
 
         def advance(state):
             z, _, count = state
-            moved = operator(z, models)
+            moved = operator(z, parameters)
             return moved, jnp.abs(moved - z).max(), count + 1
 
-        return jax.lax.while_loop(keep_going, advance, (z, jnp.inf, 0))[0]
+        z, change, _ = jax.lax.while_loop(keep_going, advance, (z, jnp.full_like(step, jnp.inf), 0))
+        return jnp.where(change <= jnp.maximum(tolerance, eps**0.5 * contraction), z, jnp.nan)
 
-    f, y = _problem(source, target, anchored).start()
-    return solve(jnp.concatenate([f.ravel(), y.ravel()]), (source, target))[:size].reshape(n, m)
+    f, y = problem.start()
+    found = solve(jnp.concatenate([f.ravel(), y.ravel()]), (source, target, step))
+    return found[:size].reshape(n, m)
 
 
 def _problem(source, target, anchored) -> HomomorphismProblem:

@@ -90,25 +90,28 @@ def step(problem: HomomorphismProblem, state: InteriorPointState) -> InteriorPoi
         moved = zip(primal, dual, *move[:2], strict=True)
         return tuple((s + steps[0] * ds) * (y + steps[1] * dy) for s, y, ds, dy in moved)
 
-    mu = _total(y * s for y, s in zip(dual, primal, strict=True)) / count
-    predictor, steps = aim(tuple(jnp.zeros_like(y) for y in dual))
-    ahead = _total(products(predictor, steps)) / count
-    mu *= jnp.clip(ahead / mu, 0.0, 1.0) ** 3
-    second_order = (ds * dy for ds, dy in zip(*predictor[:2], strict=True))
-    goals = tuple(jnp.where(mask, mu - term, 0.0) for mask, term in zip(masks, second_order, strict=True))
-
-    def centre(_, best):
-        goals, move, steps = best
+    def pursue(k, best):
+        """The k-th move: predictor, corrector, or a corrector that is kept if it is the longer step."""
+        goals, move, steps, mu = best
+        ahead = _total(products(move, steps)) / count
+        mu = jnp.where(k == 1, mu * jnp.clip(ahead / mu, 0.0, 1.0) ** 3, mu)
+        second_order = (ds * dy for ds, dy in zip(*move[:2], strict=True))
+        corrected = (mu - term for term in second_order)
         trial = products(move, tuple(jnp.minimum(1.0, 1.5 * length + 0.1) for length in steps))
+        centred = (goal + _towards_centre(value, mu) for goal, value in zip(goals, trial, strict=True))
         goals = tuple(
-            goal + jnp.where(mask, _towards_centre(value, mu), 0.0)
-            for goal, value, mask in zip(goals, trial, masks, strict=True)
+            jnp.where(mask & (k > 0), jnp.where(k == 1, one, other), 0.0)
+            for mask, one, other in zip(masks, corrected, centred, strict=True)
         )
-        other = (goals, *aim(goals))
-        is_longer = sum(other[2]) > sum(steps)
-        return jax.tree.map(lambda new, old: jnp.where(is_longer, new, old), other, best)
+        other = (goals, *aim(goals), mu)
+        is_kept = (k <= 1) | (sum(other[2]) > sum(steps))
+        return jax.tree.map(lambda new, old: jnp.where(is_kept, new, old), other, best)
 
-    _, move, steps = jax.lax.fori_loop(0, _CORRECTORS, centre, (goals, *aim(goals)))
+    mu = _total(y * s for y, s in zip(dual, primal, strict=True)) / count
+    nothing = tuple(jnp.zeros_like(y) for y in dual)
+    start = (nothing, (nothing, nothing, jnp.zeros_like(mu)), (jnp.zeros_like(mu),) * 2, mu)
+    # In one loop, so that the solve is compiled once.
+    _, move, steps, _ = jax.lax.fori_loop(0, 2 + _CORRECTORS, pursue, start)
     moved = _follow(state, move, tuple(jnp.minimum(1.0, _TO_BOUNDARY * length) for length in steps))
     return _update_bounds(problem, moved).replace(steps=state.steps + 1)
 

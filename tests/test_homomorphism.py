@@ -332,6 +332,17 @@ def test_exact_homomorphisms_are_similar_in_float32(tolerance):
     assert not np.any(similar[error > tolerance])
 
 
+def test_exact_lumpings_of_many_states_are_similar_in_float32():
+    """110 states within one step of their centre onto two: the rounding of so many terms decides nothing."""
+    size = 110
+    model = np.zeros((size + 2, 1, size + 2))
+    model[0, 0, 1:size] = 1.0 / (size - 1)
+    model[1:size, 0, 0], model[1:size, 0, 1:size] = 0.3, 0.7 / (size - 1)
+    model[size:, 0, size:] = [[0.0, 1.0], [0.3, 0.7]]
+    mdp = MDP.from_dense(model.astype(np.float32), discount=0.9)
+    np.testing.assert_array_equal(locally_similar(mdp, [0, 1], [size, size]), [True, False])
+
+
 def test_decisions_stop_early():
     """A threshold far from the error is decided in a fraction of the iterations."""
     mdp, _ = model_of("blocks")
@@ -487,6 +498,95 @@ def test_a_pair_that_is_not_a_number_spoils_no_other():
     values, gradients = compiled(True)(sources, targets)
     np.testing.assert_allclose(values[1:], small_errors(True)[1:], rtol=0, atol=1e-6)
     assert not np.isfinite(values[0]) and np.all(np.isfinite(gradients[0][1:]))
+
+
+def test_one_state():
+    """Anchored, its one row is fixed: the error is what leaves the target's centre. To one state everything fits."""
+    alone = np.ones((1, 2, 1))
+    leaving = np.array([[[0.6, 0.4], [1.0, 0.0]], [[0.0, 1.0], [0.0, 1.0]]])
+    value, slope = jax.value_and_grad(homomorphism_error, argnums=1)(alone, leaving)
+    np.testing.assert_allclose(value, 0.4, rtol=0, atol=1e-6)
+    direction = np.zeros((2, 2, 2))
+    direction[0, 0] = [-1.0, 1.0]
+    np.testing.assert_allclose(np.sum(slope * direction), 1.0, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(homomorphism_error(leaving, alone), 0.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(homomorphism_error(alone, leaving, anchored=False), 0.0, rtol=0, atol=1e-6)
+    assert oracles.homomorphism_lp(alone, leaving)[0] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    "twice",
+    [
+        jax.hessian(homomorphism_error),
+        jax.jacfwd(jax.jacfwd(homomorphism_error)),
+        jax.jit(jax.jacrev(jax.grad(homomorphism_error))),
+        jax.vmap(jax.hessian(homomorphism_error)),
+    ],
+    ids=["forward over reverse", "forward over forward", "reverse over reverse", "under vmap"],
+)
+def test_second_derivatives_are_refused(twice, request):
+    index = slice(0, 2) if "vmap" in request.node.name else 0
+    with pytest.raises(ValueError, match="homomorphism_error has first derivatives only"):
+        twice(*(model[index] for model in small_pairs()))
+
+
+def test_an_open_bracket_is_no_number(monkeypatch):
+    monkeypatch.setattr(homomorphism_module, "_MAX_ITERATIONS", 16)
+    monkeypatch.setattr(homomorphism_module, "suits_interior_point", lambda *args: False)
+    rng = np.random.default_rng(1)
+    value, slope = jax.value_and_grad(homomorphism_error)(random_model(rng, 3, 2), random_model(rng, 5, 2))
+    assert np.isnan(value) and np.isnan(slope).all()
+
+
+@functools.cache
+def labelled_pairs():
+    """Models of three and four states with one label each."""
+    rng = np.random.default_rng(11)
+    return tuple(np.stack(a) for a in zip(*([rng.dirichlet(np.ones(3), (3, 2)), rng.dirichlet(np.ones(4), (4, 2)),
+                 rng.random((3, 2, 1)), rng.random((4, 2, 1))] for _ in range(4)), strict=True))  # fmt: skip
+
+
+def labelled_error(source, target, source_labels, target_labels):
+    return homomorphism_error(source, target, source_labels=source_labels, target_labels=target_labels)
+
+
+def test_labels_and_their_derivatives():
+    """Against HiGHS, and differences of it, in random directions of all four arrays; forward and in reverse."""
+    pairs = labelled_pairs()
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(labelled_error, argnums=(0, 1, 2, 3))))(*pairs)
+    rng, h, smooth = np.random.default_rng(12), 1e-5, 0
+
+    def exact(arrays):
+        return oracles.homomorphism_lp(*arrays[:2], True, arrays[2:])[0]
+
+    for i in range(4):
+        arrays = [array[i] for array in pairs]
+        middle = exact(arrays)
+        np.testing.assert_allclose(values[i], middle, rtol=0, atol=1e-6)
+        moves = [rng.normal(size=array.shape) for array in arrays]
+        moves[:2] = [move - move.mean(axis=-1, keepdims=True) for move in moves[:2]]
+        up, down = (exact([a + t * move for a, move in zip(arrays, moves, strict=True)]) for t in (h, -h))
+        one_sided = np.sort([up - middle, middle - down]) / h
+        slope = sum(np.sum(g[i] * move) for g, move in zip(slopes, moves, strict=True))
+        assert one_sided[0] - 2e-3 <= slope <= one_sided[1] + 2e-3
+        smooth += one_sided[1] - one_sided[0] < 1e-3
+    assert smooth >= 3
+    _, forward = jax.jvp(labelled_error, tuple(arrays), tuple(moves))
+    np.testing.assert_allclose(forward, slope, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("source_labels", "target_labels", "message"),
+    [
+        (np.ones((3, 2, 1)), None, "must be given together"),
+        (np.ones((3, 1, 1)), np.ones((4, 2, 1)), r"source_labels must have shape \[3, 2, L\], got \(3, 1, 1\)"),
+        (np.ones((3, 2, 1)), np.ones((4, 2, 2)), r"target_labels must have shape \(4, 2, 1\), got \(4, 2, 2\)"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused(source_labels, target_labels, message):
+    source, target = (model[0] for model in small_pairs())
+    with pytest.raises(ValueError, match=message):
+        labelled_error(source, target, source_labels, target_labels)
 
 
 def test_float32_error():

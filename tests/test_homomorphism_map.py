@@ -1,5 +1,7 @@
 """The regularised map: against a fine solve by SciPy, its error against HiGHS, its derivative against differences."""
 
+import sys
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,8 @@ import pytest
 
 from jaxhom import homomorphism_map
 from jaxhom.pdhg.homomorphism_lp import plain_forward
+
+homomorphism_map_module = sys.modules["jaxhom.homomorphism_map"]
 
 
 def pair(seed, n=3, m=2, num_actions=2):
@@ -67,6 +71,11 @@ def test_derivative_against_differences(argument, rng):
     numeric = (score(1e-5) - score(-1e-5)) / 2e-5
     assert abs(numeric) > 1e-3
     np.testing.assert_allclose(jax.grad(score)(0.0), numeric, rtol=1e-4)
+
+
+def test_a_map_that_is_not_found_is_no_number(monkeypatch):
+    monkeypatch.setattr(homomorphism_map_module, "_MAX_ITERATIONS", 10)
+    assert np.isnan(homomorphism_map(*pair(1, 4, 3, 1), regularization=0.03)).all()
 
 
 def test_vmap_agrees():

@@ -11,6 +11,7 @@ import oracles
 import pytest
 from jaxopt.projection import projection_l1_ball, projection_simplex
 
+from jaxhom import interior_point
 from jaxhom.lane_queue import solve_many
 from jaxhom.pdhg import SOLVER, PDHGState, Status, engine, projections
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem, plain_adjoint, plain_forward
@@ -227,6 +228,40 @@ def test_homomorphism_products(n, m, rng):
         np.testing.assert_allclose(adjoint[..., lane], expected, rtol=0, atol=1e-12)
     inner = np.einsum("iakb,iakb->b", y, forward), np.einsum("ikb,ikb->b", f, adjoint)
     np.testing.assert_allclose(*inner, rtol=1e-11, atol=1e-12)
+
+
+def test_homomorphism_products_with_labels_and_many_actions(rng):
+    """Beyond the terms that are written out, with two labels behind the columns."""
+    source, target = random_pair(rng, 3, 4, num_actions=40)
+    labels = rng.normal(size=(3, 40, 2, 4)), rng.normal(size=(4, 40, 2, 4))
+    problem = homomorphism_problem(source, target)
+    problem = dataclasses.replace(problem, source_labels=labels[0], target_labels=labels[1])
+    f, y = rng.normal(size=(3, 4, 4)), rng.normal(size=(3, 40, 6, 4))
+    forward, adjoint = products(problem, f, y)
+    for lane in range(4):
+        models = source[..., lane], target[..., lane]
+        own, other = (side[..., lane] for side in labels)
+        apart = own[:, None] - other  # [n, m, A, L]
+        expected = np.einsum("ik,ikal->ial", f[..., lane], apart)
+        np.testing.assert_allclose(forward[:, :, 4:, lane], expected, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(forward[:, :, :4, lane], plain_forward(*models, f[..., lane]), rtol=0, atol=1e-13)
+        expected = plain_adjoint(*models, y[:, :, :4, lane]) + np.einsum("ial,ikal->ik", y[:, :, 4:, lane], apart)
+        np.testing.assert_allclose(adjoint[..., lane], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [engine.SOLVER, interior_point.SOLVER])
+def test_programs_do_not_grow_with_the_number_of_actions(solver):
+    """Compiling takes as long for 256 actions as for 32."""
+
+    def size(num_actions):
+        shapes = {"source": (5, num_actions, 5, 8), "target": (5, num_actions, 5, 8)}
+        arrays = {name: jax.ShapeDtypeStruct(shape, float) for name, shape in shapes.items()}
+        sizes = jax.ShapeDtypeStruct((8,), np.int32)
+        problem = HomomorphismProblem(**arrays, source_size=sizes, target_size=sizes, anchored=True)
+        state = jax.eval_shape(solver.init, problem)
+        return len(jax.jit(solver.step).lower(problem, state).as_text().splitlines())
+
+    assert size(256) < 1.5 * size(32)
 
 
 @pytest.mark.parametrize("lanes", [1, 4])

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxhom.pdhg.projections import project_l1_ball, project_simplex
 
 _MAX_UNROLL = 32
-_MAX_TERMS = 128
+_MAX_TERMS = 64
 
 
 @jax.tree_util.register_dataclass

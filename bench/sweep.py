@@ -5,6 +5,7 @@ fails is tried draw by draw; a draw that fails is a row with its error, and the 
 """
 
 import dataclasses
+import functools
 import sys
 import threading
 import time
@@ -184,7 +185,8 @@ def _evaluate(problem: Problem, policy: jax.Array):
     domain = problem.domain
     events = None if domain.off_road is None else {"off_road": domain.off_road}
     options = {"terminal": domain.terminal, "events": events}
-    return jaxhom.evaluate_exactly(domain.bare, policy, problem.reward, problem.setting.trial, **options)
+    evaluate = functools.partial(jaxhom.evaluate_exactly, horizon=problem.setting.trial, **options)
+    return jax.jit(evaluate)(domain.bare, policy, problem.reward)  # what is not finite comes back so, lane by lane
 
 
 def _run_trials(problem: Problem, policy: jax.Array):

@@ -7,6 +7,10 @@ feature expectations come from linear solves, and LPAL turns them into a policy 
 Importing the library changes no JAX setting. For float64, set `jax_enable_x64` before making models.
 """
 
+from jaxhom import interrupts
+
+interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
+
 from jaxhom.brackets import LocalSimilarity
 from jaxhom.demonstrations import (
     Demonstrations,

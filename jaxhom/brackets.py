@@ -4,9 +4,9 @@ PDHG decides quickly on which side of a threshold an error lies and takes models
 needs about ten steps to any tolerance, each with a factorisation of the size of the map. `bracket_errors` is the one
 place that chooses.
 
-Bounds are widened by the rounding of the sums behind them, which is known beforehand. Where it would take up much of the
-tolerance, as in float32 it does from about ten states on, PDHG runs until its bounds are as close as asked for but for
-that, and the points that it found are judged in float64 on the host.
+Bounds are widened by the rounding of the sums behind them, which is known beforehand. Where it would take up much of
+the tolerance, as in float32 it does from about ten states on, PDHG runs until its bounds are as close as asked for but
+for that, and the points that it found are judged in float64 on the host.
 """
 
 from collections.abc import Callable
@@ -133,8 +133,9 @@ def bracket_errors(
 def lower_bounds_without_iterations(source, target, source_labels=None, target_labels=None) -> np.ndarray:
     """Lower bounds on the anchored errors of P pairs from single dual entries y at the centre, [P].
 
-    Labels of the centre meet those of the centre alone. The centre is mapped to the centre, so (K f)(0,a,0) >= T(0,a,0) - T'(0,a,0): the maps of the other states only add
+    The centre is mapped to the centre, so (K f)(0,a,0) >= T(0,a,0) - T'(0,a,0): the maps of the other states only add
     to it. And off the centre (K f)(0,a,k) <= sum_{j != 0} T(0,a,j) - T'(0,a,k): what leaves is all that can arrive.
+    Labels of the centre meet those of the centre alone.
 
     Args:
       source, target, source_labels, target_labels: NumPy, as in `bracket_errors`.

@@ -12,12 +12,15 @@ _MAX_ONE_BY_ONE = 32  # larger models have their ties broken all at once
 _SEED = np.uint64(0x9E3779B97F4A7C15)
 
 
-def canonical_forms(transition: np.ndarray, bits: int) -> tuple[list[bytes], np.ndarray]:
+def canonical_forms(
+    transition: np.ndarray, bits: int, labels: np.ndarray | None = None
+) -> tuple[list[bytes], np.ndarray]:
     """Keys that are equal only if two models of the same size are equal up to renaming.
 
     Args:
       transition: [P, n, A, n], the centre of each model is its state 0.
-      bits: probabilities count as equal if they agree to 2^-bits.
+      bits: probabilities and labels count as equal if they agree to 2^-bits.
+      labels: [P, n, A, L], what else a renaming has to keep.
 
     Returns:
       P keys, and the order of the states that each is read off in, int [P, n], centre first.
@@ -25,6 +28,10 @@ def canonical_forms(transition: np.ndarray, bits: int) -> tuple[list[bytes], np.
     quanta = np.rint(transition.astype(np.float64) * 2.0**bits).astype(np.uint64)
     count, size = quanta.shape[:2]
     colour = np.broadcast_to(np.where(np.arange(size) == 0, 1, 2).astype(np.uint64), (count, size))
+    if labels is not None:
+        marks = np.rint(labels.astype(np.float64) * 2.0**bits).astype(np.int64).view(np.uint64).reshape(count, size, -1)
+        place = np.arange(marks.shape[2], dtype=np.uint64)
+        colour = _mix(colour + _mix(_mix(marks) + place).sum(axis=2))
     colour = _refine(quanta, colour)
     active = np.arange(count)
     while True:
@@ -36,7 +43,11 @@ def canonical_forms(transition: np.ndarray, bits: int) -> tuple[list[bytes], np.
     order = np.argsort(np.where(np.arange(size) == 0, np.uint64(0), colour), axis=1, kind="stable")
     rows = np.take_along_axis(quanta, order[:, :, None, None], axis=1)
     canonical = np.take_along_axis(rows, order[:, None, None, :], axis=3)
-    return [model.tobytes() for model in canonical], order
+    keys = [model.tobytes() for model in canonical]
+    if labels is not None:
+        ordered = np.take_along_axis(marks, order[:, :, None], axis=1)
+        keys = [key + mark.tobytes() for key, mark in zip(keys, ordered, strict=True)]
+    return keys, order
 
 
 def _refine(quanta: np.ndarray, colour: np.ndarray) -> np.ndarray:

@@ -68,7 +68,10 @@ def certified_maps(mdp: MDP, sources, targets, distance: int, anchored: bool) ->
     differs = np.ones(count, bool)
     for pair, (n, m) in enumerate(zip(from_models.size, to_models.size, strict=True)):
         source, target = from_models.transition[pair, :n, :, :n], to_models.transition[pair, :m, :, :m]
-        renaming = isomorphism(source, target)
+        labels = None
+        if from_models.labels is not None:
+            labels = from_models.labels[pair, :n], to_models.labels[pair, :m]
+        renaming = isomorphism(source, target, labels)
         if renaming is not None:
             f = np.eye(m, dtype=dtype)[renaming]
             result.maps[pair, :n, :m] = f
@@ -110,7 +113,7 @@ def _padded(models, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     transition = np.moveaxis(models.transition[pairs], 0, -1)
     size = len(transition)
     room = 2 ** int(np.ceil(np.log2(max(size, _SMALL)))) - size
-    labels = getattr(models, "labels", None)
+    labels = models.labels
     if labels is not None:
         labels = np.pad(np.moveaxis(labels[pairs], 0, -1), [(0, room), (0, 0), (0, 0), (0, 0)])
     return np.pad(transition, [(0, room), (0, 0), (0, room), (0, 0)]), labels

@@ -75,6 +75,7 @@ class Demonstrations:
         if not trajectories:
             raise ValueError("at least one trajectory is needed, got none")
         rows = [_validated_trajectory(i, pair) for i, pair in enumerate(trajectories)]
+        require_no_steps(list(enumerate(trajectories)), "trajectory")
         if terminated is None:
             terminated = np.zeros(len(rows), bool)
         terminated = _require_flags("terminated", checks.as_host_array("terminated", terminated), len(rows))
@@ -320,6 +321,31 @@ def _inverse_cdf(cumulative: jax.Array, uniform: jax.Array) -> jax.Array:
     total = cumulative[-1]
     target = jnp.minimum(uniform * total, jnp.nextafter(total, jnp.zeros_like(total)))
     return jnp.searchsorted(cumulative, target, side="right").astype(jnp.int32)
+
+
+def require_no_steps(pairs, kind: str) -> None:
+    """Raises if nothing tells pairs (states, actions) from episodes of two steps (state, action) each.
+
+    That is so where all pairs hold two and two numbers, and are not in the form that is asked for, a tuple of two lists
+    or arrays. A single longer one shows what is meant.
+
+    Args:
+      pairs: what was given, with its position, [(position, pair), ...].
+      kind: what a pair is called in the message.
+    """
+    if pairs and all(_may_be_steps(pair) for _, pair in pairs):
+        position, pair = pairs[0]
+        raise ValueError(
+            f"{kind} {position} could be (states, actions) or two steps (state, action), got "
+            f"{checks.in_one_line(pair)}: pass a tuple of two lists or arrays, ([state, state], [action, action])"
+        )
+
+
+def _may_be_steps(pair) -> bool:
+    parts = [part for part in pair if isinstance(part, tuple | list | np.ndarray) and len(part) == 2]
+    if len(parts) < 2 or any(hasattr(entry, "__len__") for part in parts for entry in part):
+        return False
+    return not isinstance(pair, tuple) or all(isinstance(part, tuple) for part in parts)
 
 
 def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,6 @@ Whatever the method, `Generalization.explain` says where a state's policy came f
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import jax
@@ -35,13 +34,10 @@ from jaxhom.local_models import LocalModelClasses, local_model_classes
 from jaxhom.mdp import MDP
 from jaxhom.votes import Votes, vote_of_nearest, vote_of_rings
 
+_ARRAYS = ("policy", "visited", "radius", "support", "error_lower", "error_upper")
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["policy", "visited", "radius", "support", "error_lower", "error_upper"],
-    meta_fields=[],
-    drop_fields=["explainer"],
-)
+
+@jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Generalization:
     """A policy for every state, and where each state's came from.
@@ -66,6 +62,15 @@ class Generalization:
     error_lower: jax.Array | None = None
     error_upper: jax.Array | None = None
     explainer: Callable[["Generalization", int], Explanation] | None = None
+
+    def tree_flatten_with_keys(self):
+        """The arrays, by name; what explains is dropped."""
+        return tuple((jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in _ARRAYS), None
+
+    @classmethod
+    def tree_unflatten(cls, _, arrays) -> "Generalization":
+        """The generalization of these arrays, which has forgotten how it was made."""
+        return cls(**dict(zip(_ARRAYS, arrays, strict=True)))
 
     def replace(self, **changes) -> "Generalization":
         """Returns the generalization with the given fields exchanged."""

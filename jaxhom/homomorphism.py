@@ -23,10 +23,13 @@ from tqdm import tqdm
 from jaxhom import checks, interior_point
 from jaxhom.brackets import METHODS, LocalSimilarity, bracket_errors, suits_interior_point
 from jaxhom.first_order import first_order_only
+from jaxhom.inputs import as_model
 from jaxhom.local_models import (
     LocalModelClasses,
+    LocalModelMaker,
+    LocalModels,
+    is_oversized,
     local_model_classes,
-    local_models,
     model_rounding,
 )
 from jaxhom.mdp import MDP
@@ -38,6 +41,9 @@ _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
 _CHUNK_LANES = 32  # of `homomorphism_error` under vmap
 _CHUNK_BYTES = 256 * 2**20
 _MAX_ITERATIONS = 100_000
+_MAX_PRODUCTS = 2e11  # multiplications per pair: large models stop early, with the bounds they have
+_MIN_ITERATIONS = 64
+_TOO_LARGE = -2
 
 
 def local_similarity(
@@ -74,6 +80,7 @@ def local_similarity(
 
     Source: Boularias and Chaib-draa 2010, eq. (9).
     """
+    mdp = as_model(mdp)
     _check_options(method, tolerance)
     sources, targets = _validated_pairs(mdp, sources, targets)
     classes, source_label, target_label = _classes_of_pairs(mdp, sources, targets, distance)
@@ -123,6 +130,7 @@ def locally_similar(
 
     Source: Boularias and Chaib-draa 2010, section V.
     """
+    mdp = as_model(mdp)
     _check_options("auto", tolerance)
     if not threshold >= 0:
         raise ValueError(f"threshold must not be negative, got {threshold}")
@@ -161,25 +169,24 @@ class ClassSimilarity:
         self.rounding = model_rounding(mdp.dtype)
         self.num_solved = 0
         self._mdp, self.distance = mdp, distance
+        self._maker = LocalModelMaker(mdp, distance)
         self._groups = _size_groups(classes.size)
-        self._models: dict[int, np.ndarray] = {}
-        num_classes = len(classes.representative)
-        # -1: not known; a decision for every ordered pair of classes that has been met.
-        self._decided = np.full((num_classes, num_classes), -1, np.int8)
+        self._known = _PairTable(len(classes.representative), mdp.dtype)
+
+    @property
+    def num_undecided(self) -> int:
+        """Pairs that were met and could not be settled; they count as different."""
+        return int((self._known.bounds.status != Status.SOLVED).sum())
 
     def decide(self, sources, targets, *, mutual=False, progress=False) -> np.ndarray:
         """bool [P]: is e(source class, target class) <= threshold? Only pairs not met before are solved."""
         pairs = np.stack([sources, targets], axis=1).reshape(-1, 2)
         met = np.concatenate([pairs, pairs[:, ::-1]]) if mutual else pairs
-        unknown = np.unique(met[self._decided[met[:, 0], met[:, 1]] < 0], axis=0)
+        unknown = self._known.missing(met)
         if len(unknown):
-            bounds = self.solve(unknown, progress=progress)
-            similar = bounds.upper <= self.threshold + self.tolerance
-            self._decided[unknown[:, 0], unknown[:, 1]] = similar
-        answer = self._decided[pairs[:, 0], pairs[:, 1]] == 1
-        if mutual:
-            answer &= self._decided[pairs[:, 1], pairs[:, 0]] == 1
-        return answer
+            self._known.add(unknown, self.solve(unknown, progress=progress))
+        similar = self._known.look_up(met).upper <= self.threshold + self.tolerance
+        return similar[: len(pairs)] & similar[len(pairs) :] if mutual else similar
 
     def solve(self, pairs: np.ndarray, *, progress: bool = False) -> LocalSimilarity:
         """Bounds for different ordered pairs of classes [Q, 2]; a class against itself has an isomorphism."""
@@ -187,12 +194,14 @@ class ClassSimilarity:
         lower, upper = np.zeros(count, dtype), np.full(count, self.rounding, dtype)
         iterations, status = np.zeros((2, count), np.int32)
         groups = self._paddings(pairs)
+        too_large = groups[:, 0] == _TOO_LARGE
+        upper[too_large], status[too_large] = 1.0, Status.ITERATION_LIMIT
         self.num_solved += int((groups[:, 0] >= 0).sum())
         with tqdm(total=count, desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
             bar.update(int((groups[:, 0] < 0).sum()))
             for group in np.unique(groups[groups[:, 0] >= 0], axis=0):
                 (members,) = np.nonzero((groups == group).all(axis=1))
-                width = max(self._transitions(side).shape[1] for side in group)
+                width = max(self._width(side) for side in group)
                 chunk = max(1, _CHUNK_BYTES // (width**2 * self._mdp.num_actions * self._mdp.dtype.itemsize))
                 for start in range(0, len(members), chunk):
                     index = members[start : start + chunk]
@@ -205,30 +214,35 @@ class ClassSimilarity:
         return LocalSimilarity(lower=lower, upper=upper, iterations=iterations, status=status)
 
     def _paddings(self, pairs: np.ndarray) -> np.ndarray:
-        """The size groups [Q, 2] to which the models of each pair are padded; -1 for a class against itself.
+        """The size groups [Q, 2] to which the models of each pair are padded; negative where there is nothing to solve.
 
-        Both sides alike where they are small, so that few shapes are compiled; each to its own where one is large.
+        -1 for a class against itself, -2 where a model is too large. Both sides alike where they are small, so that few
+        shapes are compiled; each to its own where one is large.
         """
         groups = self._groups[pairs]
         larger = groups.max(axis=1, keepdims=True)
         groups = np.where(larger <= _ALIKE_GROUP, larger, groups)
+        too_large = is_oversized(self.classes.size, self._mdp.num_actions)[pairs].any(axis=1, keepdims=True)
+        groups = np.where(too_large, _TOO_LARGE, groups)
         return np.where(pairs[:, :1] == pairs[:, 1:], -1, groups)
 
     def _solve_group(self, pairs: np.ndarray, group: np.ndarray, slack: float, update) -> LocalSimilarity:
         """Brackets for pairs [Q, 2] whose models are of the given size groups, good when widened by `slack`."""
-        source, target = (
-            self._transitions(size)[self._rows(size)[side]] for size, side in zip(group, pairs.T, strict=True)
-        )
+        source, target = (self._models(size, side) for size, side in zip(group, pairs.T, strict=True))
+        (_, n, num_actions, _), m = source.transition.shape, target.transition.shape[1]
+        affordable = _MAX_PRODUCTS / (2.0 * num_actions * n * m * (n + m))
         return bracket_errors(
-            source,
-            target,
+            source.transition,
+            target.transition,
             source_size=self.classes.size[pairs[:, 0]],
             target_size=self.classes.size[pairs[:, 1]],
+            source_labels=source.labels,
+            target_labels=target.labels,
             anchored=self.anchored,
             tolerance=max(self.tolerance - 2.0 * slack, 0.5 * self.tolerance),
             threshold=None if self.threshold is None else self.threshold + slack,
             method=self.method,
-            max_iterations=self.max_iterations,
+            max_iterations=int(min(self.max_iterations, max(affordable, _MIN_ITERATIONS))),
             progress=update,
         )
 
@@ -240,16 +254,45 @@ class ClassSimilarity:
         blamed = np.where(status == Status.SOLVED, Status.STALLED, status)
         return np.where(is_open, blamed, Status.SOLVED)
 
-    def _rows(self, group: int) -> np.ndarray:
-        """Position of each class among those of the group and below; meaningless for larger ones."""
-        return np.cumsum(self._groups <= group) - 1
+    def _width(self, group: int) -> int:
+        """States of the largest class up to a size group."""
+        return int(self.classes.size[self._groups <= group].max())
 
-    def _transitions(self, group: int) -> np.ndarray:
-        """[C', n, A, n], the models of the classes up to a size group, padded to the largest of them."""
-        if group not in self._models:
-            states = self.classes.representative[self._groups <= group]
-            self._models[group] = local_models(self._mdp, states, self.distance).transition
-        return self._models[group]
+    def _models(self, group: int, classes: np.ndarray) -> LocalModels:
+        """The models of the given classes [Q], padded to the width of a size group."""
+        different, position = np.unique(classes, return_inverse=True)
+        models = self._maker.make(self.classes.representative[different], self._width(group))
+        return jax.tree.map(lambda leaf: leaf[position], models)
+
+
+class _PairTable:
+    """What is known of ordered pairs of classes; only of those that have been met."""
+
+    def __init__(self, num_classes: int, dtype):
+        self._num_classes = num_classes
+        self._keys = np.zeros(0, np.int64)
+        numbers, counts = np.zeros(0, dtype), np.zeros(0, np.int32)
+        self.bounds = LocalSimilarity(lower=numbers, upper=numbers, iterations=counts, status=counts)
+
+    def missing(self, pairs: np.ndarray) -> np.ndarray:
+        """Those of the pairs [P, 2] that are not here, each once."""
+        keys = np.setdiff1d(self._key(pairs), self._keys)
+        return np.stack(np.divmod(keys, self._num_classes), axis=1)
+
+    def add(self, pairs: np.ndarray, bounds: LocalSimilarity) -> None:
+        """Takes in pairs that are missing."""
+        keys = np.concatenate([self._keys, self._key(pairs)])
+        order = np.argsort(keys)
+        self._keys = keys[order]
+        self.bounds = jax.tree.map(lambda old, new: np.concatenate([old, new])[order], self.bounds, bounds)
+
+    def look_up(self, pairs: np.ndarray) -> LocalSimilarity:
+        """Bounds of pairs [P, 2] that are here."""
+        place = np.searchsorted(self._keys, self._key(pairs))
+        return jax.tree.map(lambda leaf: leaf[place], self.bounds)
+
+    def _key(self, pairs: np.ndarray) -> np.ndarray:
+        return pairs[:, 0].astype(np.int64) * self._num_classes + pairs[:, 1]
 
 
 def homomorphism_error(

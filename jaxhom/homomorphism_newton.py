@@ -25,7 +25,8 @@ def factorise(problem: HomomorphismProblem, is_row, free, d_plus, d_minus, d_f) 
 
     Args:
       problem: the LPs.
-      is_row: bool [n, A, m + L, lanes], the entries of K f that exist. free: bool [n, m, lanes], those of f that can move.
+      is_row: bool [n, A, m + L, lanes], the entries of K f that exist.
+      free: bool [n, m, lanes], those of f that can move.
       d_plus, d_minus: [n, A, m + L, lanes], y+ / s+ and y- / s-; 0 where there is no row. d_f: [n, m, lanes], z / f.
 
     Returns:

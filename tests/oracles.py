@@ -192,13 +192,14 @@ def homomorphism_residual(source, target, mapping):
     return np.max(np.abs(through_source - through_target))
 
 
-def homomorphism_lp(source, target, anchored=True, labels=None):
+def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
     """LP (9) between `source` [n, A, n] and `target` [m, A, m]: (error, map [n, m]).
 
     Minimise e over f >= 0 with sum_k f(i, k) = 1 and, for all i, k, a,
     |sum_j T(i, a, j) f(j, k) - sum_j f(i, j) T'(j, a, k)| <= e.
     `anchored` requires in addition f(0, 0) = 1: state 0 is the centre of both models. `labels`, [n, A, L] and
-    [m, A, L], add |l(i, a) - sum_k f(i, k) l'(k, a)| <= e for every label.
+    [m, A, L], add |l(i, a) - sum_k f(i, k) l'(k, a)| <= e for every label. `refused`: the last state of each model is
+    mapped to the other, and nothing else is.
     The variables are f, row by row, and e.
     """
     n, num_actions, _ = source.shape
@@ -219,6 +220,9 @@ def homomorphism_lp(source, target, anchored=True, labels=None):
     bounds = [(0.0, None)] * (n * m + 1)
     if anchored:
         bounds[0] = (1.0, 1.0)
+    if refused:
+        for i in range(n):
+            bounds[i * m + m - 1] = (float(i == n - 1),) * 2
     result = _solve_lp(
         cost=np.append(np.zeros(n * m), 1.0),
         A_ub=sparse.block_array([[difference, minus_e], [-difference, minus_e]]),

@@ -15,6 +15,7 @@ PACKAGE = ROOT / "jaxhom"
 # The table of the design: a module imports only from rows with a smaller number than its own.
 # Inside a package (pdhg, lpal, domains, interop, plotting, cli) the modules may import one another, one way.
 ROWS = {
+    "interrupts": -1,  # signals and pipes
     "status": -1,  # how an answer ended
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
     "canonical_forms": -1,  # arrays in, keys out
@@ -32,6 +33,7 @@ ROWS = {
     "impossible_steps": 0.6,
     "episode_ends": 0.6,
     "demonstrations": 1,
+    "host_graph": 0.6,
     "local_models": 1,
     "lane_queue": 0.5,
     "inverse_factor": 0.5,

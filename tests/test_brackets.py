@@ -134,7 +134,10 @@ def test_rows_that_lead_nowhere():
 def test_labels_that_say_nothing():
     """Constant ones change nothing; a large range raises the bound that costs nothing."""
     source, target = models(0, 4, 3)
-    labels = {"source_labels": np.full((*source.shape[:3], 2), 3.0), "target_labels": np.full((*target.shape[:3], 2), 3.0)}
+    labels = {
+        "source_labels": np.full((*source.shape[:3], 2), 3.0),
+        "target_labels": np.full((*target.shape[:3], 2), 3.0),
+    }
     assert_holds(bracket_errors(source, target, method="interior_point", **labels), errors(source, target))
 
 
@@ -154,7 +157,9 @@ def test_bounds_without_iterations_with_labels():
     source, target, labels = labelled(9)
     bound = lower_bounds_without_iterations(source, target, *labels.values())
     assert (bound <= errors(source, target, labels=labels.values()) + 1e-9).all()
-    assert (bound >= np.abs(labels["source_labels"][:, 0] - labels["target_labels"][:, 0]).max(axis=(1, 2)) - 1e-12).all()
+    assert (
+        bound >= np.abs(labels["source_labels"][:, 0] - labels["target_labels"][:, 0]).max(axis=(1, 2)) - 1e-12
+    ).all()
     large = {name: 5.0 * label for name, label in labels.items()}
     found = bracket_errors(source, target, threshold=0.01, **large)
     optimum = errors(source, target, labels=large.values())

@@ -297,7 +297,7 @@ def test_an_environment_that_needs_an_end_state(in_folder, monkeypatch, capsys):
 def test_without_gymnasium_a_line_says_what_to_install(in_folder, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     error = error_of(capsys, "learn", "--env", LAKE, "--expert", "1", "--output", "out")
-    assert "pip install 'jaxhom[interop]'" in error
+    assert "pip install '.[interop]'" in error
 
 
 POLICY = "policy.npz --mdp model.npz "
@@ -343,4 +343,4 @@ def test_plot_without_matplotlib_says_what_to_install(in_folder, monkeypatch, ca
     for name in [name for name in sys.modules if name.startswith("jaxhom.plotting")]:
         monkeypatch.delitem(sys.modules, name)
     error = error_of(capsys, *["plot", "policy", "policy.npz", "--mdp", "model.npz", "--output", "x.png"])
-    assert "pip install 'jaxhom[plot]'" in error
+    assert "pip install '.[plot]'" in error

@@ -243,7 +243,7 @@ def test_no_pictures_without_matplotlib(files, monkeypatch, capsys):
     for name in [name for name in sys.modules if name.startswith("jaxhom.plotting")]:
         monkeypatch.delitem(sys.modules, name)
     assert main(["learn", *files.options(), "--method", "maximum-entropy"]) == 0
-    assert "pip install 'jaxhom[plot]'" in capsys.readouterr().out
+    assert "pip install '.[plot]'" in capsys.readouterr().out
     assert not list(files["out"].glob("*.png")) and files.report()["finished"]
 
 
@@ -274,7 +274,9 @@ def test_a_signal_interrupts(files):
     """The real thing, in a process of its own: LPAL is asked for more than there is and would take its 500 columns."""
     hard = ["--method", "maximum-entropy", "--features", "states", "--lpal", "--lpal-tolerance", "1e-300"]
     command = [sys.executable, "-m", "jaxhom", "learn", *files.options(), *hard]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    restore = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731  # the tests may run in the background
+    pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, preexec_fn=restore, **pipes) as process:
         deadline = time.monotonic() + 120
         while not files["out/generalization.npz"].exists() and time.monotonic() < deadline:
             time.sleep(0.02)

@@ -48,13 +48,13 @@ def test_ragged_trajectories_are_padded_and_masked():
 @pytest.mark.parametrize(
     "trajectories",
     [
-        iter([((0.0, 3.0), (1.0, 1.0))]),
-        np.array([[[0, 3], [1, 1]]], np.uint8),
-        [(jnp.array([0, 3]), np.array([1, 1]))],
+        iter([((0.0, 3.0, 3.0), (1.0, 1.0, 0.0))]),
+        np.array([[[0, 3, 3], [1, 1, 0]]], np.uint8),
+        [(jnp.array([0, 3, 3]), np.array([1, 1, 0]))],
     ],
 )
 def test_any_whole_numbers_in_any_sequence_will_do(trajectories):
-    expected = Demonstrations.from_trajectories([([0, 3], [1, 1])])
+    expected = Demonstrations.from_trajectories([([0, 3, 3], [1, 1, 0])])
     chex.assert_trees_all_equal(Demonstrations.from_trajectories(trajectories), expected)
 
 
@@ -77,11 +77,21 @@ def test_any_whole_numbers_in_any_sequence_will_do(trajectories):
         ([([0, 2**31], [0, 1])], "trajectory 0 states[1] must be below 2147483647, got 2147483648"),
         ([(["left"], [0])], "trajectory 0 states must hold integers, got dtype <U4"),
         (None, "trajectories must be a sequence of pairs (states, actions), got NoneType"),
+        ([[(3, 1), (4, 0)]], "trajectory 0 could be (states, actions) or two steps (state, action), got [(3, 1), (4"),
+        ([((3, 1), (4, 0))], "trajectory 0 could be"),
+        ([[[3, 1], [4, 0]]] * 2, "trajectory 0 could be"),
+        (np.array([[[3, 1], [4, 0]]]), "trajectory 0 could be"),
     ],
 )
 def test_from_trajectories_refuses(trajectories, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         Demonstrations.from_trajectories(trajectories)
+
+
+def test_two_steps_are_what_longer_trajectories_show_them_to_be():
+    demonstrations = Demonstrations.from_trajectories([[(3, 4), (1, 0)], [(0, 1, 2), (1, 1, 0)]])
+    np.testing.assert_array_equal(demonstrations.states[0, :2], [3, 4])
+    np.testing.assert_array_equal(demonstrations.actions[0, :2], [1, 0])
 
 
 def test_one_long_trajectory_among_many_is_refused_before_it_is_padded():

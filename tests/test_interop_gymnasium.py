@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 from small_models import dense_transition
 
-from jaxhom.interop import GymnasiumModel, demonstrations_from_episodes, from_gymnasium, from_samples
+from jaxhom.interop import (
+    GymnasiumModel,
+    demonstrations_from_episodes,
+    from_gymnasium,
+    from_samples,
+    make_environment,
+)
+from jaxhom.interop.environments import require_steps_of_table
 from jaxhom.planning import optimal_policy
 
 DISCOUNT = 0.9
@@ -148,6 +155,100 @@ def test_states_that_end_only_some_episodes_need_the_end_state(table, initial, h
     np.testing.assert_allclose(model_values(model)[:2], table_values(table), rtol=0, atol=1e-12)
 
 
+ENDLESS = {0: {0: [(1.0, 1, 5.0, False)], 1: [(1.0, 0, 1.0, False)]}, 1: {0: [], 1: []}}
+
+
+@pytest.mark.parametrize("last", [{0: [], 1: []}, {}, []])
+def test_states_without_rows_absorb(last):
+    """State 1 is entered without `terminated`, and nothing is said about what follows: nothing does."""
+    for end_state in (False, True):
+        model = from_gymnasium(toy({**ENDLESS, 1: last}), discount=DISCOUNT, end_state=end_state)
+        np.testing.assert_array_equal(np.asarray(model.terminal)[:2], [False, True])
+        assert not model.mdp.restricts_actions
+        np.testing.assert_array_equal(dense_transition(model.mdp)[1, :, 1], 1.0)
+        np.testing.assert_allclose(model_values(model)[:2], [10.0, 0.0], rtol=1e-12)
+
+
+def test_actions_that_a_state_lacks_are_not_allowed():
+    """In a dictionary or a list, at the end or in between; and with an end state as well."""
+    table = {
+        0: {0: [(1.0, 1, 1.0, False)], 2: [(0.5, 1, 4.0, False), (0.5, 2, 0.0, True)]},
+        1: {1: [(1.0, 0, 2.0, False)]},
+        2: [[(1.0, 2, 9.0, False)]],
+    }
+    expected = [[True, False, True], [False, True, False]]
+    for end_state in (False, True):
+        model = from_gymnasium(toy(table, (1.0, 0.0, 0.0)), discount=0.5, end_state=end_state)
+        np.testing.assert_array_equal(model.mdp.allowed[:2], expected)
+        # V0 = max(1 + V1 / 2, 2 + V1 / 4), V1 = 2 + V0 / 2
+        plan = optimal_policy(model.mdp, model.reward)
+        np.testing.assert_allclose(plan.value[:2], [20 / 7, 24 / 7], rtol=1e-9)
+        np.testing.assert_array_equal(np.asarray(plan.policy).argmax(axis=1)[:2], [2, 1])
+
+
+class Sticky(gymnasium.ActionWrapper):
+    """Every action is the first."""
+
+    def action(self, _):
+        return 0
+
+
+def test_steps_outside_the_table_are_found():
+    for name, options in (CASES["lake 4x4"], CASES["taxi"], ("CliffWalking", {"is_slippery": True})):
+        with gymnasium.make(newest(name), **options) as env:
+            require_steps_of_table(env)
+    with Sticky(gymnasium.make("FrozenLake-v1", is_slippery=False)) as env:
+        message = "FrozenLakeEnv: action 2 led from state 0 to 0, which its table P gives probability 0"
+        with pytest.raises(ValueError, match=message):
+            require_steps_of_table(env)
+    with gymnasium.make("CartPole-v1") as env:
+        require_steps_of_table(env)
+
+
+def test_ids_are_stepped_and_environments_are_left_alone():
+    gymnasium.register("Sticky-v0", entry_point=lambda: Sticky(gymnasium.make("FrozenLake-v1", is_slippery=False)))
+    try:
+        with pytest.raises(ValueError, match="led from state 0 to 0"):
+            from_gymnasium("Sticky-v0", discount=DISCOUNT)
+    finally:
+        gymnasium.registry.pop("Sticky-v0")
+    with gymnasium.make("FrozenLake-v1", is_slippery=False) as env:
+        env.reset(seed=0)
+        env.step(2)
+        from_gymnasium(env, discount=DISCOUNT)
+        assert env.step(2)[0] == 2
+
+
+def test_an_option_outside_the_table_is_refused():
+    with gymnasium.make(newest("Taxi"), fickle_passenger=True) as env:
+        for wrapped in (env, env.unwrapped):
+            with pytest.raises(ValueError, match="fickle_passenger=True, which its table P does not contain"):
+                from_gymnasium(wrapped, discount=DISCOUNT)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("FrozenLake-v1", {"is_slippery": "nope"}, "'FrozenLake-v1': is_slippery must be true or false, got 'nope'"),
+        ("FrozenLake-v1", {"is_slippery": None}, "is_slippery must be true or false, got None"),
+        ("FrozenLake-v1", {"wet": 1}, "has no option 'wet'; it has render_mode, desc, map_name, is_slippery"),
+        ("FrozenLake-v1", {"map_name": "5x5"}, "cannot be made with map_name='5x5': KeyError '5x5'"),
+        ("Nothing-v0", {"a": (1, 2)}, "'Nothing-v0' cannot be made with a=(1, 2): Environment `Nothing` doesn't exist"),
+    ],
+)
+def test_options_that_environments_do_not_understand(name, options, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as raised:
+        make_environment(name, **options)
+    assert "\n" not in str(raised.value)
+
+
+def test_options_that_environments_understand():
+    options = {"desc": ("SF", "FG"), "is_slippery": 0, "max_episode_steps": 3}
+    with make_environment("FrozenLake-v1", **options) as env:
+        assert env.unwrapped.desc.shape == (2, 2) and env.spec.max_episode_steps == 3
+        assert len(env.unwrapped.P[0][1]) == 1
+
+
 def test_trajectories_recorded_in_an_environment_are_demonstrations():
     with gymnasium.make("FrozenLake-v1") as env:
         model, episodes, ends = from_gymnasium(env, discount=DISCOUNT), [], []
@@ -194,13 +295,12 @@ GOOD = {0: {0: [(1.0, 1, 0.0, True)]}, 1: {0: [(1.0, 1, 0.0, True)]}}
         (toy({}), "at least one state and one action"),
         (toy({0: {}, 1: {}}), "at least one state and one action"),
         (toy({1: GOOD[0], 2: GOOD[1]}), r"as P\[state\]\[action\], both numbered from 0: KeyError 0"),
-        (toy({0: GOOD[0], 1: {0: GOOD[1][0], 1: GOOD[1][0]}}), r"P\[1\] has 2 actions, but P\[0\] has 1"),
         (toy(3), r"as P\[state\]\[action\]"),
         (toy({**GOOD, 0: {0: [0.5, 0.5]}}), r"P\[0\]\[0\]\[0\] must be \(probability, next state, .*got 0.5"),
         (toy({**GOOD, 0: {0: [np.eye(3)]}}), r"P\[0\]\[0\]\[0\] must be"),
         (toy({**GOOD, 0: {0: [(1.0, 1, 0.0)]}}), r"P\[0\]\[0\]\[0\] must be"),
         (toy({**GOOD, 0: {0: [(1.0, "left", 0.0, True)]}}), r"P\[0\]\[0\]\[0\] must be"),
-        (toy({**GOOD, 0: {0: []}}), r"sum of P: probability\[0, 0\] must be 1, got 0"),
+        (toy({**GOOD, 0: {0: []}}), r"initial\[0\] is positive, but P has no outcome there.*got 1.0"),
         (toy({**GOOD, 1: {0: [(1.1, 0, 0.0, True)]}}), r"sum of P: probability\[1, 0\] must be 1, got 1.1"),
         (toy({**GOOD, 1: {0: [(np.nan, 0, 0.0, True)]}}), r"P: probability\[1, 0, 0\] must be finite"),
         (toy({**GOOD, 1: {0: [(1.0, 2, 0.0, True)]}}), r"P: next state\[1, 0, 0\] must be below 2, got 2"),
@@ -219,7 +319,7 @@ def test_environments_that_are_refused(env, message):
 
 def test_without_gymnasium_an_id_says_what_to_install_and_an_environment_needs_nothing(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(ImportError, match=r"pip install 'jaxhom\[interop\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[interop\]'"):
         from_gymnasium("FrozenLake-v1", discount=DISCOUNT)
     assert from_gymnasium(toy(GOOD), discount=DISCOUNT).mdp.num_states == 2
 

@@ -58,8 +58,11 @@ def test_letters_of_either_case_and_spaces_are_road():
         ("1 2 3\n" + MAP, "track line 1: a header must be"),
         ("5\n", "track line 1: a header must be"),
         ("dim: 0 0\n", "track has no road cell (space, . or S) in its 0 rows"),
-        ("dim: 4 5\n" + MAP.replace("g", "o"), "track line 4, column 4: unknown letter 'o'; use X, x or # (wall)"),
-        ("5\n4\n" + MAP.replace("s", "@"), "track line 4, column 2: unknown letter '@'"),
+        (
+            "dim: 4 5\n" + MAP.replace("g", "q"),
+            "track line 4, column 4: unknown letter 'q'; use X, x, #, o or @ (wall)",
+        ),
+        ("5\n4\n" + MAP.replace("s", "&"), "track line 4, column 2: unknown letter '&'"),
         ("5 4\n\n" + MAP, "track has 5 rows, but its header says 4 rows of 5 columns"),
         (MAP.replace("g", "\f"), r"track line 3, column 4: unknown letter '\x0c'"),
         ("\n\n", "track has no road cell"),

@@ -16,6 +16,7 @@ from jaxhom.interop import (
     demonstrations_from_csv,
     demonstrations_from_episodes,
     demonstrations_from_steps,
+    demonstrations_from_transitions,
 )
 
 # What is meant: two episodes, which ended in states 4 and 1.
@@ -50,9 +51,10 @@ def imitation(obs, acts):
     return Trajectory(np.asarray(obs), np.asarray(acts), None, True)
 
 
-def minari(obs, acts):
-    ends = np.zeros(len(acts), bool)
-    return EpisodeData(7, np.asarray(obs), np.asarray(acts), np.zeros(len(acts)), ends, ends)
+def minari(obs, acts, terminated=False):
+    ends = np.arange(len(acts)) == len(acts) - 1
+    flags = ends & terminated, ends & (not terminated)
+    return EpisodeData(7, np.asarray(obs), np.asarray(acts), np.zeros(len(acts)), *flags)
 
 
 def trajectories(demonstrations):
@@ -62,6 +64,13 @@ def trajectories(demonstrations):
 
 
 EXPECTED = [(states[:-1], actions) for states, actions in EPISODES]
+FLAT = types.SimpleNamespace(  # the fields of `imitation`'s transitions
+    obs=np.array([0, 2, 3, 3, 2]),
+    acts=np.array([1, 0, 0, 1, 0]),
+    infos=np.array([{}] * 5),
+    next_obs=np.array([2, 4, 3, 1, 0]),
+    dones=np.array([False, True, False, False, False]),
+)
 DATA_SETS = {
     "imitation": lambda: [imitation(*episode) for episode in EPISODES],
     "minari": lambda: (minari(*episode) for episode in EPISODES),
@@ -84,6 +93,21 @@ def test_episodes_without_their_final_observation():
     demonstrations, report = demonstrations_from_episodes([imitation(*episode) for episode in EXPECTED])
     assert trajectories(demonstrations) == EXPECTED
     assert report.final_observations == 0
+
+
+def test_episodes_say_how_they_ended():
+    timed_out = dataclasses.replace(imitation([0, 1], [0]), infos=np.array([{"TimeLimit.truncated": True}]))
+    episodes = [
+        imitation([0, 1], [0]),
+        timed_out,
+        minari([0, 1], [0], terminated=True),
+        minari([0, 1], [0]),
+        ([0, 2], [0]),
+        ([0], [0]),
+    ]
+    demonstrations, _ = demonstrations_from_episodes(episodes)
+    np.testing.assert_array_equal(demonstrations.terminated, [True, False, True, False, False, False])
+    np.testing.assert_array_equal(demonstrations.final_states, [1, 1, 1, 1, 2, -1])
 
 
 def test_one_hot_observations_need_to_states():
@@ -130,7 +154,7 @@ def test_unusable_episodes_are_dropped_and_reported(episode, reason):
     ((position, said),) = report.dropped
     assert position == 1 and said.startswith(reason)
     assert str(report).splitlines() == [
-        "2 episodes, 4 steps; 2 final observations dropped",
+        "2 episodes, 4 steps; 2 final observations",
         f"episode 1 dropped: {said}",
     ]
     with pytest.raises(ValueError, match=re.escape(f"none of 1 episodes can be used; episode 0: {reason}")):
@@ -148,6 +172,14 @@ def test_unusable_episodes_are_dropped_and_reported(episode, reason):
         ),
         ([([0], [0], [0.0])], "episode 0 must have obs and acts"),
         ([{"obs": [0, 1], "actions": [0]}], "episode 0 must have obs and acts"),
+        ([[(3, 1), (4, 0)]], "episode 0 could be (states, actions) or two steps (state, action)"),
+        ([[[3, 1], [4, 0]]] * 3, "episode 0 could be (states, actions) or two steps"),
+        ([[(3, 1), (4, 0), (2, 2)]], "episode 0 must have obs and acts"),
+        (imitation([0, 1], [0]), "pass a list of episodes, or, if these are flattened transitions, use"),
+        (FLAT, "flattened transitions, use demonstrations_from_transitions"),
+        ([FLAT], "episode 0 ends before its last step (dones): if these are flattened transitions"),
+        ([vars(FLAT) | {"dones": None}], "episode 0 jumps: a next observation is not that of the next step: if"),
+        ([vars(FLAT) | {"dones": None, "next_obs": None, "timeouts": [1, 0, 0, 0, 0]}], "its last step (timeouts)"),
     ],
 )
 def test_what_is_no_episode_is_an_error(episodes, message):
@@ -156,6 +188,57 @@ def test_what_is_no_episode_is_an_error(episodes, message):
 
 
 # ------------------------------------------------------------------------------------ flat arrays
+
+
+def test_transitions_are_cut_where_an_episode_ended_or_was_cut_off():
+    """Three episodes: one terminated in 4, one was cut off in 1, one goes on at the end of the recording."""
+    demonstrations, report = demonstrations_from_transitions(FLAT.obs, FLAT.acts, FLAT.next_obs, FLAT.dones)
+    assert trajectories(demonstrations) == [([0, 2], [1, 0]), ([3, 3], [0, 1]), ([2], [0])]
+    np.testing.assert_array_equal(demonstrations.terminated, [True, False, False])
+    np.testing.assert_array_equal(demonstrations.final_states, [4, 1, 0])
+    assert report == ImportReport(episodes=3, steps=5, final_observations=3, dropped=())
+
+
+def test_transitions_give_trajectories_back():
+    """Random episodes, flattened as `imitation` does it: `dones` only where one terminated."""
+    rng = np.random.default_rng(3)
+    lengths = rng.integers(1, 6, size=40)
+    states = [np.arange(n + 1) + 10 * i for i, n in enumerate(lengths)]  # no episode begins where another ended
+    actions = [rng.integers(0, 4, size=n) for n in lengths]
+    terminated = rng.random(40) < 0.5
+    obs, next_obs = (np.concatenate([s[part] for s in states]) for part in (slice(-1), slice(1, None)))
+    dones = np.concatenate([(np.arange(n) == n - 1) & end for n, end in zip(lengths, terminated, strict=True)])
+    arguments = np.eye(410)[obs], np.concatenate(actions)[:, None], np.eye(410)[next_obs], dones
+    demonstrations, _ = demonstrations_from_transitions(*arguments, to_states=lambda obs: obs.argmax(axis=-1))
+    expected = Demonstrations.from_trajectories(list(zip(states, actions, strict=True)), terminated)
+    for name in ("states", "actions", "mask", "terminated", "final_states"):
+        np.testing.assert_array_equal(getattr(demonstrations, name), getattr(expected, name))
+
+
+def test_a_cut_that_cannot_be_seen_can_be_told():
+    flat = [0, 1, 1], [0, 0, 0], [1, 1, 0]
+    demonstrations, _ = demonstrations_from_transitions(*flat, [0, 0, 1])
+    assert trajectories(demonstrations) == [([0, 1, 1], [0, 0, 0])]
+    demonstrations, _ = demonstrations_from_transitions(*flat, [0, 0, 1], truncated=[False, True, True])
+    assert trajectories(demonstrations) == [([0, 1], [0, 0]), ([1], [0])]
+    assert not np.any(demonstrations.terminated)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": []}, "observations must have shape (0, ...) like observations, T >= 1, got (0,)"),
+        ({"actions": [0]}, "actions must have shape (2, ...) like observations"),
+        ({"next_observations": [[1], [0]]}, "next_observations must have shape (2,) like observations, got (2, 1)"),
+        ({"dones": [[0], [1]]}, "dones must have shape (2,) like observations, got (2, 1)"),
+        ({"dones": [0, 2]}, "dones[1] must be True or False, got 2"),
+        ({"truncated": ["no", "yes"]}, "truncated must be bool, got dtype <U3"),
+    ],
+)
+def test_bad_transitions_are_refused(changes, message):
+    good = {"observations": [0, 1], "actions": [0, 0], "next_observations": [1, 0], "dones": [0, 1]}
+    with pytest.raises(ValueError, match=re.escape(message)):
+        demonstrations_from_transitions(**good | changes)
 
 
 @pytest.mark.parametrize("ids", [[5, 5, 3, 5], ["b", "b", "a", "b"], [0.5, 0.5, 0.1, 0.5]])
@@ -237,6 +320,15 @@ def test_csv_lines_without_action_are_final_observations(read):
     demonstrations, report = read("episode,state,action\n0,0,1\n1,9,\n0,2,0\n0,2,1\n0,4,\n2,3,0\n2,1, \n")
     assert trajectories(demonstrations) == EXPECTED
     assert report == ImportReport(episodes=2, steps=4, final_observations=2, dropped=(("1", "it has no actions"),))
+    np.testing.assert_array_equal(demonstrations.final_states, [4, 1])
+
+
+@pytest.mark.parametrize("column", ["step", "T", " time", "timestep"])
+def test_csv_lines_are_sorted_by_their_step(read, column):
+    demonstrations, report = read(f"{column},episode,state,action\n7,a,2,1\n9,a,4,\n0,b,3,0\n5,a,2,0\n2.0,a,0,1\n")
+    assert trajectories(demonstrations) == EXPECTED
+    np.testing.assert_array_equal(demonstrations.final_states, [4, -1])
+    assert report.final_observations == 1
 
 
 @pytest.mark.parametrize(
@@ -252,6 +344,13 @@ def test_csv_lines_without_action_are_final_observations(read):
         ("episode,state,action\n0,1,\n", "none of 1 episodes can be used; episode 0: it has no actions"),
         ("episode,state,action\n0,0,1\n0,2\n", "line 3: 2 fields, but the first line names more columns"),
         ("episode,state,action\n,0,1\n", "line 2, column 'episode': is empty"),
+        ("episode,state,action\n0,0,1\n0,2,1,7\n", "line 3: 4 fields, but the first line names 3 columns"),
+        ("episode,state,action,t\n0,0,1,1\n0,2,1,0\n0,2,1,1\n", "lines 2 and 4: step 1 occurs twice in its episode"),
+        ("episode,state,action,t\n0,0,1,noon\n", "line 2, column 't': must be a whole number, got 'noon': the column"),
+        ("episode,state,action,t\n0,0,1,0.5\n", "line 2, column 't': must be a whole number, got '0.5'"),
+        ("episode,state,action,Step\n0,0,1\n", "line 2, column 'Step': must be a whole number, got ''"),
+        ("episode,state,action,t,step\n", "line 1: columns 't' and 'step' could both number the steps: keep one"),
+        ("episode,state,action,t\n0,0,,0\n0,2,1,1\n", "line 3: a step after its episode's final observation"),
         ("episode,state,action\n0,,1\n", "line 2, column 'state': must be a whole number, got ''"),
         ("episode,state,action\n0,1.5,1\n", "line 2, column 'state': must be a whole number, got '1.5'"),
         ("episode,state,action\n\n0,1,up\n", "line 3, column 'action': must be a whole number, got 'up'"),
@@ -281,6 +380,6 @@ def test_missing_csv_files_are_one_line(tmp_path):
 
 def test_demonstrations_are_what_from_trajectories_builds():
     demonstrations, _ = demonstrations_from_episodes(EPISODES)
-    expected = Demonstrations.from_trajectories(EXPECTED)
-    for name in ("states", "actions", "mask"):
+    expected = Demonstrations.from_trajectories(EPISODES)
+    for name in ("states", "actions", "mask", "terminated", "final_states"):
         np.testing.assert_array_equal(getattr(demonstrations, name), getattr(expected, name))

@@ -355,5 +355,5 @@ def test_without_matplotlib_one_message_names_the_extra():
     command = [sys.executable, "-c", code]
     root = pathlib.Path(__file__).parents[1]
     result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    assert result.stderr.strip().splitlines()[-1].endswith("pip install 'jaxhom[plot]'")
+    assert result.stderr.strip().splitlines()[-1].endswith("pip install '.[plot]'")
     assert "ImportError: jaxhom.plotting needs matplotlib" in result.stderr

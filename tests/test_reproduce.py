@@ -253,6 +253,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path, monkeypatch):
     path = tmp_path / "raw" / "tiny.csv"
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     options = {"cwd": ROOT, "env": os.environ | cache, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    options["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # the tests may run in the background
     kept = []
     for stop, code in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
         with subprocess.Popen([sys.executable, "-c", TINY, *command], **options) as process:

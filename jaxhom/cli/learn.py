@@ -8,6 +8,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from jaxhom import interrupts
 from jaxhom.cli import pictures, results
 from jaxhom.cli.methods import METHODS, check_method, generalize, wants_progress
 from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_method_options, add_model_options
@@ -84,6 +85,7 @@ def run(options) -> None:
     try:
         _learn(problem, demonstrations, origin, options, output)
     except KeyboardInterrupt:
+        interrupts.rest()
         raise KeyboardInterrupt("written so far: " + (", ".join(output.written) or "nothing")) from None
     print("\nWritten: " + ", ".join(output.written))
 

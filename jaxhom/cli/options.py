@@ -1,16 +1,18 @@
 """Options that several commands share, and the kinds of values that they take."""
 
 import argparse
+import ast
 import json
 
 from jaxhom.cli.methods import METHODS
 
 MODEL_HELP = """\
 models:
-  --env ID [NAME=VALUE ...]   a Gymnasium environment with a transition table, and options of its constructor;
-                              needs pip install 'jaxhom[interop]'
+  --env ID [NAME=VALUE ...]   a Gymnasium environment with a transition table, and options of its constructor: true,
+                              false, numbers, texts, lists; needs pip install '.[interop]'
   --mdp a, --mdp b            the racetracks that come with the library
-  --mdp MAP.track             a racetrack: one letter per cell, X or # wall, space or . road, S start, F or G finish
+  --mdp MAP.track             a racetrack, one letter per cell: X, #, o or @ wall, space, . or P road, S start, F or G
+                              finish
   --mdp MODEL.npz             arrays of your own; see `python -m jaxhom learn --help` for their names
 """
 
@@ -70,6 +72,12 @@ def add_demonstration_options(parser: Parser) -> None:
         "racetracks, 100 elsewhere)",
     )
     group.add_argument("--seed", type=count, default=0, metavar="N", help="of the sampling (default 0)")
+    group.add_argument(
+        "--impossible",
+        choices=("refuse", "warn", "ignore"),
+        default="warn",
+        help="what to do about demonstrated steps that the model gives probability 0 (default warn)",
+    )
 
 
 def add_method_options(parser: Parser, names: tuple[str, ...] = tuple(METHODS)) -> None:
@@ -119,19 +127,37 @@ def count(text: str) -> int:
     return number
 
 
+_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "none": None, "null": None}
+
+
 def environment_options(words: list[str]) -> dict:
-    """`["is_slippery=false", "map_name=8x8"]` -> {"is_slippery": False, "map_name": "8x8"}; values are JSON or text.
+    """`["is_slippery=false", "map_name=8x8"]` -> {"is_slippery": False, "map_name": "8x8"}.
 
     Raises:
-      ValueError: if a word is no NAME=VALUE.
+      ValueError: if a word is no NAME=VALUE, a name comes twice, or a value begins like a list and is none.
     """
     options = {}
     for word in words:
         name, equals, text = word.partition("=")
         if not equals or not name.isidentifier():
             raise ValueError(f"--env: expected NAME=VALUE after the id, got {word!r}")
-        try:
-            options[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(text, text))
-        except ValueError:
-            options[name] = text
+        if name in options:
+            raise ValueError(f"--env: {name} is given twice")
+        options[name] = _option_value(name, text.strip())
     return options
+
+
+def _option_value(name: str, text: str):
+    """A truth value (true, yes, on, false, no, off in any case), JSON, a Python literal such as a tuple, or text."""
+    word = text.lower()
+    if word in _WORDS:
+        return _WORDS[word]
+    for read in (json.loads, ast.literal_eval):
+        try:
+            return read(text)
+        except (ValueError, SyntaxError):
+            continue
+    if text.startswith(("[", "(", "{", '"', "'")):
+        example = """'desc=["SF", "FG"]'"""
+        raise ValueError(f"--env: {name} is neither JSON nor a Python value, got {text}; a list of texts is {example}")
+    return text

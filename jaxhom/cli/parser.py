@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import jax
 
+from jaxhom import interrupts
 from jaxhom.cli import evaluate, explain, learn, main_job, plot
 from jaxhom.cli.options import Parser
 
@@ -30,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxhom: error: {str(error).partition(chr(10))[0]}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interruption:
+        interrupts.rest()
         print("; ".join(["jaxhom: interrupted", *map(str, interruption.args)]), file=sys.stderr)
         return 130
     return 0

@@ -14,6 +14,8 @@ from collections.abc import Callable
 
 from jaxhom.interop.files import save_demonstrations, save_policy
 
+_FILES = (".csv", ".json", ".npy", ".txt", ".png", ".svg", ".pdf", ".pkl", ".mat", ".h5", ".track", ".zip")
+
 
 class Results:
     """What a run writes. A path that ends in .npz takes the policy alone.
@@ -22,6 +24,7 @@ class Results:
       path: folder, made if it is missing, or file.
 
     Raises:
+      ValueError: if the name is that of another kind of file.
       OSError: if the folder cannot be made, or that of the file is missing.
     """
 
@@ -29,6 +32,9 @@ class Results:
         self.written: list[str] = []
         self._path = path
         self.is_folder = not path.lower().endswith(".npz")
+        kind = os.path.splitext(path)[1].lower()
+        if kind in _FILES and not os.path.isdir(path):
+            raise ValueError(f"--output {path}: policies are written to .npz files, everything else into a folder")
         if self.is_folder:
             os.makedirs(path, exist_ok=True)
         elif not os.path.isdir(os.path.dirname(path) or "."):

@@ -7,6 +7,8 @@ is computed.
 import dataclasses
 import functools
 import os
+import sys
+import warnings
 from typing import Any
 
 import jax
@@ -18,11 +20,12 @@ from jaxhom.cli.options import environment_options
 from jaxhom.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.domains import Racetrack, TileMap, racetrack
 from jaxhom.domains.track_maps import SHIPPED
+from jaxhom.impossible_steps import ImpossibleStepsWarning
 from jaxhom.interop.environment_maps import tile_map
-from jaxhom.interop.environments import from_gymnasium, make_environment
+from jaxhom.interop.environments import from_gymnasium, make_environment, require_steps_of_table
 from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, load_mdp, load_policy
 from jaxhom.interop.trajectories import demonstrations_from_csv
-from jaxhom.mdp import MDP
+from jaxhom.mdp import MDP, absorbing_states
 from jaxhom.planning import Plan, optimal_policy
 
 _DISCOUNT = 0.99
@@ -117,6 +120,7 @@ def _environment(options) -> Problem:
     try:
         discount = _DISCOUNT if options.discount is None else options.discount
         model = from_gymnasium(env, discount=discount, end_state=options.end_state)
+        require_steps_of_table(env)
         domain, limit = tile_map(env, model.mdp), env.spec.max_episode_steps or _STEPS
     except ValueError as error:
         raise ValueError(f"{name}: {str(error).replace('end_state=True', '--end-state')}") from None
@@ -198,24 +202,33 @@ def load_trajectories(problem: Problem, options) -> tuple[Demonstrations, str]:
         return _sample(problem, options), f"sampled from the optimal policy (seed {options.seed})"
     if options.steps is not None:
         raise ValueError("--steps belongs to --expert")
-    return load_demonstrations_of(problem, options.demonstrations)
+    return load_demonstrations_of(problem, options.demonstrations, options.impossible)
 
 
-def load_demonstrations_of(problem: Problem, path: str) -> tuple[Demonstrations, str]:
+def load_demonstrations_of(problem: Problem, path: str, impossible: str = "refuse") -> tuple[Demonstrations, str]:
     """Trajectories in the problem's model, from a .csv or .npz file, and what was read, in words.
+
+    Steps of probability 0 are refused, told on stderr ("warn") or let pass ("ignore").
 
     Raises:
       FileError: naming the file, and line and column or the array's entry.
     """
+    origin = path
     if path.lower().endswith(".csv"):
         demonstrations, report = demonstrations_from_csv(path, mdp=problem.mdp)
-        return demonstrations, "; ".join([path, *str(report).splitlines()])
-    demonstrations = load_demonstrations(path)
+        origin = "; ".join([path, *str(report).splitlines()])
+    else:
+        demonstrations = load_demonstrations(path)
     try:
-        demonstrations.validate(problem.mdp)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", ImpossibleStepsWarning)
+            demonstrations.validate(problem.mdp, impossible)
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
-    return demonstrations, path
+    for warning in told:
+        print(f"jaxhom: warning: {path}: {warning.message}", file=sys.stderr)
+    warnings.simplefilter("ignore", ImpossibleStepsWarning)  # it has been decided once
+    return demonstrations, origin
 
 
 def _sample(problem: Problem, options) -> Demonstrations:
@@ -227,6 +240,9 @@ def _sample(problem: Problem, options) -> Demonstrations:
     samples = sample_demonstrations(key, problem.mdp, problem.plan.policy, options.expert, steps)
     if problem.terminal is None:
         return samples
+    if np.asarray(absorbing_states(problem.mdp))[problem.terminal].all():
+        ends = jnp.asarray(problem.terminal)
+        return sample_demonstrations(key, problem.mdp, problem.plan.policy, options.expert, steps, terminal=ends)
     ended = np.cumsum(problem.terminal[np.asarray(samples.states)], axis=1) > 0
     lengths = (~ended).sum(axis=1)  # at least 1: no episode starts in a terminal state
     rows = zip(np.asarray(samples.states), np.asarray(samples.actions), lengths, strict=True)

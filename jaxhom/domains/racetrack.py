@@ -105,10 +105,10 @@ def racetrack(
 ) -> Racetrack:
     """Builds the racetrack of section VI.B.
 
-    A map has one letter per cell: `X`, `x` or `#` wall, space or `.` road, `S` or `s` road on the
-    start line, `F`, `G` or `g` finish line; beyond the map is wall. A header with the map's size,
-    as `.track` files of planning benchmarks have it, is understood (see `track_maps`); without one,
-    short rows are filled up with wall.
+    A map has one letter per cell: `X`, `#` or `o` wall, space, `.` or `P` road, `S` road on the
+    start line, `F` or `G` finish line, in either case, and `@` where the map ends; beyond it is
+    wall. A header with the map's size, as `.track` files of planning benchmarks have it, is
+    understood (see `track_maps`); without one, short rows are filled up with wall.
 
     Args:
       track: "a" (236 cells) or "b" (204 cells, drawn for this library: the paper's map is not

@@ -1,7 +1,8 @@
 """Maps of racetracks as text: one letter per cell, with or without the planning community's header.
 
-    X x #       wall                 S s         road on the start line
-    space .     road                 F G g       finish line
+    X x # o O   wall, obstacle       S s         road on the start line
+    @           out of bounds        F G g       finish line
+    space . P p road, pothole
 
 The first lines may give the size, in one of the forms in which `.track` files are passed around; the map that follows
 must have that size:
@@ -22,7 +23,12 @@ from importlib import resources
 
 SHIPPED = ("a", "b")
 
-_LETTERS = {"X": "#", "x": "#", "#": "#", " ": ".", ".": ".", "S": "S", "s": "S", "G": "F", "g": "F", "F": "F"}
+_LETTERS = {
+    **dict.fromkeys("Xx#oO@", "#"),
+    **dict.fromkeys(" .Pp", "."),
+    **dict.fromkeys("Ss", "S"),
+    **dict.fromkeys("GgF", "F"),
+}
 _ROWS_FIRST = re.compile(r"\s*(?:dim:\s*(\d+)\s+(\d+)|(\d+)\s*,\s*(\d+))\s*", re.ASCII | re.IGNORECASE)
 _WIDTH_FIRST = re.compile(r"\s*(\d+)\s+(\d+)\s*", re.ASCII)
 _HEADER = re.compile(r"\s*(?:dim\b|\d)", re.ASCII | re.IGNORECASE)
@@ -106,7 +112,7 @@ def _row(text: str, line: int) -> str:
         if letter not in _LETTERS:
             raise ValueError(
                 f"track line {line}, column {column}: unknown letter {letter!r}; "
-                "use X, x or # (wall), space or . (road), S or s (start), F, G or g (finish)"
+                "use X, x, #, o or @ (wall), space, . or p (road), S or s (start), F, G or g (finish)"
             )
     return "".join(_LETTERS[letter] for letter in text)
 

@@ -29,6 +29,7 @@ from jaxhom.interop.trajectories import (
     demonstrations_from_csv,
     demonstrations_from_episodes,
     demonstrations_from_steps,
+    demonstrations_from_transitions,
 )
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "demonstrations_from_csv",
     "demonstrations_from_episodes",
     "demonstrations_from_steps",
+    "demonstrations_from_transitions",
     "from_gymnasium",
     "from_mdptoolbox",
     "from_samples",

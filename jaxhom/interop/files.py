@@ -6,11 +6,14 @@
                     probability       [S, A, N], rows sum to 1                        two
                     initial           [S], optional: uniform if missing
                     features          [S, A, K] or [S, K], optional
+                    allowed           bool [S, A], optional: the actions that exist
     beside a model  reward            [S, A] or [S]                                   all optional,
                     coordinates       [S, D], positions of the states                 read by the
                     terminal          bool [S], where episodes end                    command line
     demonstrations  states, actions   integers [M, H] (or [H] for one trajectory)
                     length            integers [M], optional: steps of each trajectory; H if missing
+                    terminated        bool [M], optional: whether its episode ended; False if missing
+                    final_states      integers [M], optional: the state after the last step; -1: unknown
     policy          policy            [S, A], rows sum to 1
                     and whatever else its maker put there
     each            format_version    1, optional
@@ -48,7 +51,7 @@ def load_mdp(path: str | os.PathLike, *, discount: float | None = None) -> MDP:
         discounts.
     """
     arrays = _read(path)
-    options = {name: arrays[name] for name in ("initial", "features") if name in arrays}
+    options = {name: arrays[name] for name in ("initial", "features", "allowed") if name in arrays}
     if discount is not None:
         if "discount" in arrays:
             raise FileError(f"{path}: it has a discount of its own, {checks.in_one_line(arrays['discount'].tolist())}")
@@ -83,8 +86,11 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         length = arrays.get("length", np.full(count, horizon))
         checks.require_shape("length", length, f"({count},)", length.shape == (count,))
         length = checks.require_integers("length", length, upper=horizon + 1)
-        rows = zip(states, actions, length, strict=True)
-        return Demonstrations.from_trajectories([(s[:n], a[:n]) for s, a, n in rows])
+        final = arrays.get("final_states", np.full(count, -1))
+        checks.require_shape("final_states", final, f"({count},)", final.shape == (count,))
+        rows = zip(states, actions, length, final, strict=True)
+        trajectories = [(np.append(s[:n], z) if z != -1 else s[:n], a[:n]) for s, a, n, z in rows]
+        return Demonstrations.from_trajectories(trajectories, terminated=arrays.get("terminated"))
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
 
@@ -120,7 +126,8 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
       OSError: if the file cannot be written.
     """
     layout = {"transition": mdp.probability} if mdp.is_dense else _fields(mdp, "next_state", "probability")
-    _write(path, {**layout, **_fields(mdp, "initial", "features", "discount")})
+    allowed = _fields(mdp, "allowed") if mdp.restricts_actions else {}
+    _write(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed})
 
 
 def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations) -> None:
@@ -136,7 +143,7 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     checks.require_all(
         "mask", mask, mask == prefix, "must be True on the first steps of each trajectory and only there"
     )
-    _write(path, {**_fields(demonstrations, "states", "actions"), "length": length})
+    _write(path, {**_fields(demonstrations, "states", "actions", "terminated", "final_states"), "length": length})
 
 
 def save_policy(path: str | os.PathLike, policy, **extras) -> None:

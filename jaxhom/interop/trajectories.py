@@ -1,7 +1,7 @@
 """Demonstrations from the data of other libraries, from flat arrays of steps and from CSV files.
 
 Recorded episodes hold one observation more than actions: the last is where the episode ended, and no action was taken
-there. It is dropped, as an expert's advice needs both. Observations must be state indices, whole numbers from 0 on,
+there. It becomes the episode's final state. Observations must be state indices, whole numbers from 0 on,
 each alone or in an array of one ([H, 1]); for anything else (one-hot vectors, tuples, coordinates) `to_states` says
 which state it is.
 
@@ -11,18 +11,24 @@ libraries is imported: what counts is what the objects hold.
 
 import csv
 import dataclasses
+import itertools
 import os
 from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.demonstrations import Demonstrations
+from jaxhom.demonstrations import Demonstrations, require_no_steps
 from jaxhom.interop.files import FileError
 from jaxhom.mdp import MDP
 
 COLUMNS = ("episode", "state", "action")
+STEP_COLUMNS = ("step", "t", "time", "timestep")
 _FIELDS = (("obs", "acts"), ("observations", "actions"))
+_TERMINATED = ("terminal", "terminated", "terminations", "terminals", "dones")  # under which names an end is recorded
+_CUT = ("truncated", "truncations", "timeouts")
+_NEXT = ("next_obs", "next_observations")
 _LARGEST_INDEX = 2**31 - 1
 
 
@@ -33,7 +39,7 @@ class ImportReport:
     Attributes:
       episodes: episodes that were kept, M.
       steps: steps in them.
-      final_observations: last observations without an action that were dropped from them.
+      final_observations: how many of them end with an observation after the last action, their final state.
       dropped: pairs (episode, reason): the position, counted from 0, or the CSV file's name of an episode that was
         dropped altogether.
     """
@@ -44,7 +50,7 @@ class ImportReport:
     dropped: tuple[tuple[int | str, str], ...]
 
     def __str__(self) -> str:
-        lines = [f"{self.episodes} episodes, {self.steps} steps; {self.final_observations} final observations dropped"]
+        lines = [f"{self.episodes} episodes, {self.steps} steps; {self.final_observations} final observations"]
         lines += [f"episode {episode} dropped: {reason}" for episode, reason in self.dropped]
         return "\n".join(lines)
 
@@ -57,28 +63,85 @@ def demonstrations_from_episodes(
     Args:
       episodes: M of them, or a data set with `iterate_episodes()` (Minari's). An episode is an object or a mapping with
         `obs` and `acts` (imitation's trajectories) or `observations` and `actions` (Minari's), or a pair
-        (observations, actions). H actions go with H + 1 observations, or with H if the last is missing.
+        (observations, actions). H actions go with H + 1 observations, or with H if the last is missing. One that has
+        `terminal` or `terminations` says by it whether it terminated; others count as cut off.
       to_states: takes the observations of one episode as they are stored and returns as many state indices; for
         one-hot vectors `lambda observations: observations.argmax(axis=-1)`.
 
     Returns:
-      The demonstrations, and what was dropped: final observations, and episodes that are empty, have another number of
-      observations, or hold observations or actions that are no indices.
+      The demonstrations, and what was dropped: episodes that are empty, have another number of observations, or hold
+      observations or actions that are no indices.
 
     Raises:
-      ValueError: if there is no episode, something is not an episode, or none can be used (with the first reason).
+      ValueError: if there is no episode; something is not an episode, or several episodes in a row (transitions, with
+        an end in between); nothing tells (states, actions) from two steps (state, action); or none can be used (with
+        the first reason).
     """
-    kept, dropped, final = [], [], 0
+    if _is_one(episodes):
+        raise ValueError(
+            "episodes has observations and actions itself: pass a list of episodes, or, if these are flattened "
+            "transitions, use demonstrations_from_transitions"
+        )
+    kept, ended, dropped, final, pairs = [], [], [], 0, []
     for position, episode in enumerate(_iterate(episodes)):
         observations, actions = _fields(position, episode)
+        _require_one_episode(position, episode)
+        pairs += [(position, episode)] if isinstance(episode, tuple | list) else []
         try:
             states, actions = _indices(observations, actions, to_states)
         except ValueError as error:
             dropped.append((position, str(error)))
             continue
         final += len(states) - len(actions)
-        kept.append((states[: len(actions)], actions))
-    return _finish(kept, dropped, final)
+        kept.append((states, actions))
+        ended.append(_has_terminated(episode))
+    require_no_steps(pairs, "episode")
+    return _finish(kept, dropped, final, ended)
+
+
+_FLAT = "{}: if these are flattened transitions of several episodes, demonstrations_from_transitions finds them again"
+
+
+def _field(episode, *names: str):
+    """The first of the named fields that an episode has, else None."""
+    for name in names:
+        value = episode.get(name) if isinstance(episode, Mapping) else getattr(episode, name, None)
+        if value is not None and not callable(value):
+            return value
+    return None
+
+
+def _is_one(episodes) -> bool:
+    """Whether something is one episode or set of transitions rather than a sequence of episodes."""
+    return not callable(getattr(episodes, "iterate_episodes", None)) and all(
+        _field(episodes, *names) is not None for names in zip(*_FIELDS, strict=True)
+    )
+
+
+def _require_one_episode(position: int, episode) -> None:
+    """Raises if an episode has an end before its last step, or a step that does not begin where the former led to."""
+    for name in (*_TERMINATED, *_CUT):
+        flags = np.atleast_1d(np.asarray(False if (found := _field(episode, name)) is None else found))
+        if flags[:-1].astype(bool).any():
+            raise ValueError(_FLAT.format(f"episode {position} ends before its last step ({name})"))
+    before, after = _field(episode, "obs", "observations"), _field(episode, *_NEXT)
+    if after is not None and np.shape(before) == np.shape(after) and not np.all(_continues(before, after)):
+        raise ValueError(_FLAT.format(f"episode {position} jumps: a next observation is not that of the next step"))
+
+
+def _continues(before, after) -> np.ndarray:
+    """bool [T - 1], whether each step's next observation is that of the following step."""
+    same = np.asarray(after)[:-1] == np.asarray(before)[1:]
+    return same.reshape(len(same), -1).all(axis=1)
+
+
+def _has_terminated(episode) -> bool:
+    """Whether an episode says that it ended in a terminal state, and was not cut off there (imitation's `infos`)."""
+    flags = np.atleast_1d(np.asarray(False if (found := _field(episode, *_TERMINATED)) is None else found))
+    infos = _field(episode, "infos")
+    last = infos[-1] if infos is not None and len(infos) else None
+    was_cut = isinstance(last, Mapping) and last.get("TimeLimit.truncated", False)
+    return bool(flags.size and flags[-1]) and not was_cut
 
 
 def demonstrations_from_steps(
@@ -116,12 +179,70 @@ def demonstrations_from_steps(
     return demonstrations_from_episodes(zip(*pieces, strict=True), to_states=to_states)
 
 
+def demonstrations_from_transitions(
+    observations, actions, next_observations, dones, *, truncated=None, to_states: Callable | None = None
+) -> tuple[Demonstrations, ImportReport]:
+    """Reads flattened transitions, as `imitation` and offline data sets hold them, and finds the episodes again.
+
+    An episode ends after a step with `done`, where it terminated, and wherever the next observation is not the one of
+    the following step: truncated episodes carry no `done`, and would be joined with what comes after them. What cannot
+    be seen is an episode that was cut off in the very state in which the next begins; `truncated` tells.
+
+    Args:
+      observations: [T, ...], one per step, in order.
+      actions: [T] or [T, 1].
+      next_observations: [T, ...], what followed each step.
+      dones: bool [T], whether the step ended its episode in a terminal state.
+      truncated: bool [T], whether the episode was cut off after the step, where that was recorded (`timeouts`). A step
+        with both flags was cut off.
+      to_states: as in `demonstrations_from_episodes`.
+
+    Returns:
+      The demonstrations, with `final_states` and `terminated`, and the report.
+
+    Raises:
+      ValueError: if the arrays differ in length, there is no step, flags are none, or no episode can be used.
+    """
+    arrays = {"observations": observations, "next_observations": next_observations, "actions": actions}
+    arrays = {name: checks.as_host_array(name, array) for name, array in arrays.items()}
+    length = len(np.atleast_1d(arrays["observations"]))
+    for name, array in arrays.items():
+        good = array.ndim >= 1 and len(array) == length > 0
+        checks.require_shape(name, array, f"({length}, ...) like observations, T >= 1", good)
+    before, after, actions = arrays.values()
+    checks.require_shape("next_observations", after, f"{before.shape} like observations", after.shape == before.shape)
+    truncated = _flags("truncated", np.zeros(length, bool) if truncated is None else truncated, length)
+    dones = _flags("dones", dones, length)
+    ends = np.flatnonzero(np.append((dones | truncated)[:-1] | ~_continues(before, after), True))
+    starts = np.append(0, ends[:-1] + 1)
+    episodes = [
+        {
+            "observations": np.concatenate([before[first : last + 1], after[last : last + 1]]),
+            "actions": actions[first : last + 1],
+            "terminated": bool(dones[last] and not truncated[last]),
+        }
+        for first, last in zip(starts, ends, strict=True)
+    ]
+    return demonstrations_from_episodes(episodes, to_states=to_states)
+
+
+def _flags(name: str, values, length: int) -> np.ndarray:
+    """bool [T], from booleans or zeros and ones."""
+    flags = checks.as_host_array(name, values)
+    checks.require_shape(name, flags, f"({length},) like observations", flags.shape == (length,))
+    if flags.dtype.kind not in "biuf":
+        raise ValueError(f"{name} must be bool, got dtype {flags.dtype}")
+    checks.require_all(name, flags, (flags == 0) | (flags == 1), "must be True or False")
+    return flags.astype(bool)
+
+
 def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) -> tuple[Demonstrations, ImportReport]:
     """Reads a comma-separated file with one step a line.
 
     The first line names the columns. Needed are `episode` (any text), `state` and `action` (whole numbers from 0 on);
-    others are ignored. Lines of one episode stand in the order of its steps; episodes may be interleaved. Blank lines
-    are skipped. An empty action marks the final observation of its episode.
+    others are ignored. Lines of one episode are in the order of their column `step` (or `t`, `time`, `timestep`; whole
+    numbers), or, without one, in the order of the steps as they stand; episodes may be interleaved. Blank lines are
+    skipped. An empty action marks the final observation of its episode: where it ended, its final state.
 
     Args:
       path: the file, in UTF-8.
@@ -135,15 +256,18 @@ def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) 
       FileError: if the file is missing or no text, lacks a column, or has a wrong field (naming line and column).
     """
     limits = (_LARGEST_INDEX,) * 2 if mdp is None else (mdp.num_states, mdp.num_actions)
-    steps: dict[str, list[tuple[int, int | None]]] = {}
+    lines: dict[str, list[_Line]] = {}
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, strict=True)
-            places = _places(path, next(reader, []))
+            header = next(reader, [])
+            places, of_step = _places(path, header), _place_of_step(path, header)
             for row in reader:
                 if row:
+                    _require_fields(path, reader.line_num, row, header)
                     episode, state, action = _step(path, reader.line_num, row, places, limits)
-                    _append(path, reader.line_num, steps.setdefault(episode, []), state, action)
+                    number = None if of_step is None else _step_number(path, reader.line_num, header, row, of_step)
+                    lines.setdefault(episode, []).append(_Line(reader.line_num, number, state, action))
     except UnicodeDecodeError as error:
         raise FileError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
     except OSError as error:
@@ -151,13 +275,14 @@ def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) 
     except csv.Error as error:
         raise FileError(f"{path} line {reader.line_num}: {error}") from None
     kept, dropped, final = [], [], 0
-    for episode, pairs in steps.items():
-        acted = [pair for pair in pairs if pair[1] is not None]
-        if not acted:
+    for episode, unsorted in lines.items():
+        steps = _in_order(path, unsorted)
+        actions = [step.action for step in steps if step.action is not None]
+        if not actions:
             dropped.append((episode, "it has no actions"))
             continue
-        final += len(pairs) - len(acted)
-        kept.append(tuple(np.array(acted, np.int64).T))
+        final += len(steps) - len(actions)
+        kept.append((np.array([step.state for step in steps]), np.array(actions)))
     try:
         return _finish(kept, dropped, final)
     except ValueError as error:
@@ -216,12 +341,12 @@ def _column(name: str, values) -> np.ndarray:
     return array
 
 
-def _finish(kept, dropped, final_observations: int) -> tuple[Demonstrations, ImportReport]:
+def _finish(kept, dropped, final_observations: int, terminated=None) -> tuple[Demonstrations, ImportReport]:
     if not kept:
         if not dropped:
             raise ValueError("there are no episodes")
         raise ValueError(f"none of {len(dropped)} episodes can be used; episode {dropped[0][0]}: {dropped[0][1]}")
-    demonstrations = Demonstrations.from_trajectories(kept)
+    demonstrations = Demonstrations.from_trajectories(kept, terminated=terminated)
     steps = sum(len(actions) for _, actions in kept)
     report = ImportReport(
         episodes=len(kept), steps=steps, final_observations=final_observations, dropped=tuple(dropped)
@@ -272,7 +397,49 @@ def _whole_float(text: str) -> float | None:
     return number if number.is_integer() and "_" not in text else None
 
 
-def _append(path, line: int, steps: list, state: int, action: int | None) -> None:
-    if steps and steps[-1][1] is None:
-        raise FileError(f"{path} line {line}: a step after its episode's final observation (a line without action)")
-    steps.append((state, action))
+class _Line(NamedTuple):
+    """One step of a file."""
+
+    line: int
+    number: int | None
+    state: int
+    action: int | None
+
+
+def _in_order(path, lines: list[_Line]) -> list[_Line]:
+    """The lines of one episode by their step numbers, if they have some."""
+    if lines[0].number is not None:
+        lines = sorted(lines, key=lambda line: line.number)
+        for former, line in itertools.pairwise(lines):
+            if former.number == line.number:
+                numbers = f"lines {former.line} and {line.line}"
+                raise FileError(f"{path} {numbers}: step {line.number} occurs twice in its episode")
+    for former, line in itertools.pairwise(lines):
+        if former.action is None:
+            raise FileError(
+                f"{path} line {line.line}: a step after its episode's final observation (a line without action)"
+            )
+    return lines
+
+
+def _place_of_step(path, header: list[str]) -> int | None:
+    """Where the steps' numbers stand, if there are any."""
+    places = [place for place, name in enumerate(header) if name.strip().lower() in STEP_COLUMNS]
+    if len(places) > 1:
+        names = " and ".join(repr(header[place].strip()) for place in places)
+        raise FileError(f"{path} line 1: columns {names} could both number the steps: keep one")
+    return places[0] if places else None
+
+
+def _step_number(path, line: int, header: list[str], row: list[str], place: int) -> int:
+    """The number of one line's step."""
+    column, text = header[place].strip(), row[place].strip() if place < len(row) else ""
+    try:
+        return _whole_number(path, line, column, text, _LARGEST_INDEX)
+    except FileError as error:
+        raise FileError(f"{error}: the column numbers the steps of an episode; call it otherwise if not") from None
+
+
+def _require_fields(path, line: int, row: list[str], header: list[str]) -> None:
+    if any(field.strip() for field in row[len(header) :]):
+        raise FileError(f"{path} line {line}: {len(row)} fields, but the first line names {len(header)} columns")

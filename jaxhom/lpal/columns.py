@@ -241,10 +241,10 @@ class _Solver:
         self.room = capacities(mdp.num_features)[-1]
         self.pulls = _FEW_PULLS if mdp.num_features <= _FEW_FEATURES else _PULLS
         self.error = 0.25 * _SLACK * float(tolerance.min())
-        exact = Exact(mdp)
         # Where the model's type, or iterations, have no digits left near this discount.
         is_rough = mdp.dtype != jnp.float64 or float(mdp.discount) > NEAR_ONE
-        self.exact = exact if is_rough and exact.is_direct else None
+        exact = Exact(mdp) if is_rough else None
+        self.exact = exact if exact and exact.is_direct else None
 
     def start(self, number: int, expectations: np.ndarray, policies, weights) -> _Lane:
         """The lane of one problem; with a first column if there is a policy to begin with."""

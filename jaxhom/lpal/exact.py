@@ -203,8 +203,12 @@ def _solve_directly(matrix, discount: float, right: np.ndarray) -> np.ndarray:
 
 def compact_features(features: np.ndarray, allowed: np.ndarray) -> np.ndarray:
     """Features [S, A, K] as [S, 1, K] where they are the same for all allowed actions."""
-    some = np.take_along_axis(features, allowed.argmax(axis=1)[:, None, None], axis=1)
-    depends = ((features != some).any(axis=-1) & allowed).any()
+    if allowed.all():
+        some = features[:, :1]
+        depends = (features != some).any()
+    else:
+        some = np.take_along_axis(features, allowed.argmax(axis=1)[:, None, None], axis=1)
+        depends = ((features != some) & allowed[..., None]).any()
     return features if depends else some
 
 

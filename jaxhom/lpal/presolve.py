@@ -32,12 +32,15 @@ class Reduction:
       shift: [B], c: what margins for the given ones are larger by.
       is_idle: bool [B, K], features that are the smallest for no policy.
       scarcest: [B], a feature that is never larger than those.
+      least: [B], the least that a feature can do per step which is not idle; the largest |feature| if none does
+        anything.
     """
 
     expectations: np.ndarray
     shift: np.ndarray
     is_idle: np.ndarray
     scarcest: np.ndarray
+    least: np.ndarray
 
     def weights(self, lane: int, weights: np.ndarray) -> np.ndarray:
         """Weights [K] for the given expectations of a lane from those for the reduced ones.
@@ -56,16 +59,19 @@ class Reduction:
 
 def reduce_expectations(mdp: MDP, expectations: np.ndarray) -> Reduction:
     """Reduces expectations [B, K], on the host."""
-    low, high = _reach(mdp)
+    values = _values(mdp)
+    low, high = _reach(mdp, values)
     most = (high - expectations).min(axis=1)
     least = (low - expectations).min(axis=1)
     floor = low - most[:, None]
     shift = np.clip(0.0, least, most)
+    is_idle = expectations < floor
     return Reduction(
         expectations=np.maximum(expectations, floor) + shift[:, None],
         shift=shift,
-        is_idle=expectations < floor,
+        is_idle=is_idle,
         scarcest=(high - expectations).argmin(axis=1),
+        least=_least(values, _SAME * float(np.finfo(mdp.dtype).eps), is_idle),
     )
 
 
@@ -75,10 +81,12 @@ def default_tolerance(mdp: MDP, reduction: Reduction) -> np.ndarray:
     Where features of two scales bind together, the margin is decided in the units of the smaller one. Constant features
     do nothing.
     """
-    scale = _scales(_values(mdp), _SAME * float(np.finfo(mdp.dtype).eps))
-    scale = np.where(reduction.is_idle, np.inf, scale).min(axis=1)
-    size = np.abs(np.asarray(mdp.features)).max(initial=0.0)
-    return _GAP / (1.0 - float(mdp.discount)) * np.where(np.isfinite(scale), scale, size or 1.0)
+    return _GAP / (1.0 - float(mdp.discount)) * reduction.least
+
+
+def _least(values: np.ndarray, same: float, is_idle: np.ndarray) -> np.ndarray:
+    scale = np.where(is_idle, np.inf, _scales(values, same)).min(axis=1)
+    return np.where(np.isfinite(scale), scale, np.abs(values).max() or 1.0)
 
 
 def _scales(values: np.ndarray, same: float) -> np.ndarray:
@@ -108,9 +116,8 @@ def _values(mdp: MDP) -> np.ndarray:
     return features.reshape(-1, features.shape[-1])
 
 
-def _reach(mdp: MDP) -> tuple[np.ndarray, np.ndarray]:
+def _reach(mdp: MDP, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """low [K] and high [K]; with the sums of probabilities as they are after rounding, and as they should be."""
-    values = _values(mdp)
     total = np.asarray(mdp.probability).sum(axis=-1, dtype=np.float64)[np.asarray(mdp.allowed)]
     kept = float(mdp.discount) * np.array([[min(total.min(), 1.0)], [max(total.max(), 1.0)]])
     mass = np.asarray(mdp.initial).sum(dtype=np.float64)

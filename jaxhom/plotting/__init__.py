@@ -11,13 +11,13 @@ them; ordinal levels are cividis; walls are grey, start cells green, finish cell
 A racetrack's state is a cell and one of 25 speeds. What has one number per state is drawn per cell,
 by the rule that each function states, or as a mosaic of the 25 speeds.
 
-This module needs matplotlib (`pip install 'jaxhom[plot]'`); `import jaxhom` does not import it.
+This module needs matplotlib (`pip install '.[plot]'` in a checkout); `import jaxhom` does not import it.
 """
 
 try:
     import matplotlib  # noqa: F401
 except ImportError as error:
-    raise ImportError("jaxhom.plotting needs matplotlib, which is not installed: pip install 'jaxhom[plot]'") from error
+    raise ImportError("jaxhom.plotting needs matplotlib, which is not installed: pip install '.[plot]'") from error
 
 from jaxhom.plotting.certificates import plot_bounds, plot_certificate
 from jaxhom.plotting.figures import learned_policy_figure

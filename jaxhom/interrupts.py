@@ -1,0 +1,91 @@
+"""Ctrl-C and closed pipes, for the command line: one line, exit code 130, whatever was going on.
+
+`python -m jaxhom` imports the package, JAX included, before it runs anything of `__main__`, and threads may be inside
+compiled programs when it ends. So the signal is taken over as the first thing of all, a further Ctrl-C changes nothing,
+and an interrupted process leaves without tearing the interpreter down under those threads.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+
+INTERRUPTED = 130
+_AGAIN = 3.0  # seconds after which an interruption that somebody swallowed is raised again
+
+
+def watch_while_loading() -> None:
+    """Ends the process with one line at Ctrl-C, if it is `python -m jaxhom` and its libraries are being loaded."""
+    is_loading = sys.argv[:1] == ["-m"] and "jaxhom" in sys.orig_argv
+    if is_loading and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _leave_at_once)
+
+
+def watch() -> None:
+    """Raises `KeyboardInterrupt` at the first Ctrl-C, and again some seconds later until `rest`; ignores the others.
+
+    A parent that ignores the signal (`nohup`, a job in the background) has decided that there is nothing to watch.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _raise_once)
+
+
+def rest() -> None:
+    """No further interruptions: somebody is dealing with the first."""
+    if hasattr(signal, "setitimer") and signal.getsignal(signal.SIGALRM) is _raise_again:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def leave(code: int) -> None:
+    """Ends the process; at once if it was interrupted."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    if code == INTERRUPTED:
+        os._exit(code)
+    sys.exit(code)
+
+
+class UntilClosed:
+    """A text stream that is written to until nobody reads it any more (`| head`), and never complains."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Writes, or does nothing."""
+        with contextlib.suppress(BrokenPipeError):
+            return self._stream.write(text)
+        return self._to_nowhere(len(text))
+
+    def flush(self) -> None:
+        """Likewise."""
+        try:
+            self._stream.flush()
+        except BrokenPipeError:
+            self._to_nowhere(0)
+
+    def _to_nowhere(self, written: int) -> int:
+        # What is left in the buffer would raise once more when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+        return written
+
+    def __getattr__(self, name: str):
+        return getattr(self._stream, name)
+
+
+def _leave_at_once(*_) -> None:
+    os.write(2, b"jaxhom: interrupted\n")
+    os._exit(INTERRUPTED)
+
+
+def _raise_once(*_) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "setitimer"):  # not on Windows
+        signal.signal(signal.SIGALRM, _raise_again)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN, _AGAIN)
+    raise KeyboardInterrupt
+
+
+def _raise_again(*_) -> None:
+    raise KeyboardInterrupt

@@ -1,4 +1,8 @@
-"""float64 for every test, and the small models that the tests share (see `small_models`)."""
+"""float64 for every test, the small models that the tests share (see `small_models`), and a bound on memory."""
+
+import gc
+import os
+import pathlib
 
 import jax
 import numpy as np
@@ -6,6 +10,8 @@ import pytest
 import small_models
 
 jax.config.update("jax_enable_x64", True)
+
+_MUCH = float(os.environ.get("JAXHOM_TESTS_BYTES", 1.5e9))
 
 
 @pytest.fixture(params=small_models.NAMES)
@@ -17,3 +23,15 @@ def case(request):
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_programs_leave():
+    """Compiled programs of former files add up to gigabytes: they go where a process has become large."""
+    yield
+    statistics = pathlib.Path("/proc/self/statm")
+    if statistics.exists():
+        resident = int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if resident > _MUCH:
+            jax.clear_caches()
+            gc.collect()

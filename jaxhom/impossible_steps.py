@@ -71,5 +71,7 @@ def _is_possible(mdp: MDP, steps: Steps) -> np.ndarray:
     width = probability.shape[-1]
     listed = probability.reshape(-1, width)[pairs] > 0
     successors = np.asarray(mdp.next_state).reshape(-1, width)[pairs].astype(np.int64)
-    edges = np.arange(len(pairs))[:, None] * mdp.num_states + successors
-    return np.isin(row * mdp.num_states + steps.successor, edges[listed])
+    edges = (np.arange(len(pairs))[:, None] * mdp.num_states + successors)[listed]  # ascending, as successors are
+    wanted = row * mdp.num_states + steps.successor
+    place = np.minimum(np.searchsorted(edges, wanted), len(edges) - 1)
+    return edges[place] == wanted

@@ -265,20 +265,39 @@ def test_algorithm1_variants_on_a_gridworld(rng):
 
 
 def test_mutual_similarity_is_stricter():
-    # 3 all but absorbs, so that every local model nearly folds onto it; it folds onto no other centre
+    # 3 comes back to itself, as 2 does; 0 and 1, which nothing comes back to, fold onto it, but it onto neither
     transition = np.zeros((4, 1, 4))
-    transition[0, 0, 1] = transition[1, 0, 0] = 0.5
-    transition[0, 0, 3] = transition[1, 0, 3] = 0.5
-    transition[2, 0, 3] = 1.0
-    transition[3, 0, 3], transition[3, 0, 2] = 0.99, 0.01
+    transition[0, 0, [1, 2]] = 0.5
+    transition[1:, 0, 2:] = 0.5
     demonstrations = one_step([3], [0])
-    assert oracles.algorithm1(transition, demonstrations, threshold=0.05)[1].tolist() == [1, 1, 1, 0]
-    assert oracles.algorithm1(transition, demonstrations, threshold=0.05, mutual=True)[1].tolist() == [
-        -1,
-        -1,
-        -1,
-        0,
-    ]
+    assert oracles.algorithm1(transition, demonstrations)[1].tolist() == [2, 1, 1, 0]
+    assert oracles.algorithm1(transition, demonstrations, mutual=True)[1].tolist() == [-1, -1, 1, 0]
+
+
+def test_what_was_done_in_an_absorbing_state_is_no_evidence():
+    """Every local model folds onto it; nobody learns from it."""
+    transition = np.zeros((4, 1, 4))
+    transition[0, 0, [1, 3]] = transition[1, 0, [0, 3]] = 0.5
+    transition[2, 0, 3] = transition[3, 0, 3] = 1.0
+    np.testing.assert_array_equal(oracles.absorbing(transition), [False, False, False, True])
+    for method in (oracles.algorithm1, oracles.hops_nearest_neighbors):
+        assert method(transition, one_step([3], [0]))[1].tolist() == [-1, -1, -1, 0]
+    coordinates = [[0, 0], [0, 1], [0, 2], [0, 3]]
+    absorbs = oracles.absorbing(transition)
+    policy, distance = oracles.euclidean_nearest_neighbors(coordinates, 2, one_step([0, 3], [0, 1]), absorbs)
+    np.testing.assert_array_equal(policy, [[1, 0], [1, 0], [1, 0], [0, 1]])
+    np.testing.assert_array_equal(distance, [0, 1, 2, 0])
+
+
+def test_monte_carlo_of_an_episode_that_is_absorbed(rng):
+    """Cut at the absorbing state and continued, or simulated for long."""
+    transition, features = chain(4), rng.uniform(size=(4, 1, 2))
+    walk = (np.array([1, 2]), np.array([0, 0]))
+    np.testing.assert_allclose(
+        oracles.monte_carlo_feature_expectations(features, 0.9, [walk], [np.eye(4)[3]]),
+        oracles.feature_expectations(transition, 0.9, np.eye(4)[1], features, np.ones((4, 1))),
+        rtol=1e-12,
+    )
 
 
 def test_hops_follow_the_direction_of_the_graph():

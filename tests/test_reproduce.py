@@ -97,6 +97,7 @@ def test_a_draw_is_the_same_in_every_batch(problem):
     assert (np.asarray(problem.reward) != np.asarray(other_seed.reward)).any()
 
 
+@pytest.mark.filterwarnings("ignore::jaxhom.ImpossibleStepsWarning")  # any states will do
 def test_the_action_on_the_finish_line_is_hidden(rng):
     """Of the pool the learner sees the first trajectories, without the steps that put the car back."""
     domain = problems.build_domain("track_corner", 0)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxhom.demonstrations import Demonstrations, empirical_policy, sample_demonstrations
+from jaxhom.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import Racetrack
 from jaxhom.plotting.boards import Board, board_of, draw_arrows, policy_at, require
@@ -66,7 +66,9 @@ def learned_policy_figure(
     reward = require("reward", reward, (world.num_states,), (world.num_states, len(world.moves)))
     arrows = policy_at(world, gridworld_policy, (0, 0))
     gridworld_demonstrations.validate(world.mdp, "ignore")
-    visited, _ = empirical_policy(racetrack.mdp, racetrack_demonstrations)
+    racetrack_demonstrations.validate(racetrack.mdp, "ignore")
+    visited = np.zeros(racetrack.mdp.num_states, bool)
+    visited[np.concatenate(unpadded(racetrack_demonstrations))] = True
     trials = {name: _median_trial(key, racetrack, policy, horizon) for name, policy in racetrack_policies.items()}
     left, right = _two_halves(board_of(racetrack, Racetrack), len(trials))
     reward = reward.reshape(world.num_states, -1).max(axis=1)

@@ -342,7 +342,8 @@ def require_no_steps(pairs, kind: str) -> None:
 
 
 def _may_be_steps(pair) -> bool:
-    parts = [part for part in pair if isinstance(part, tuple | list | np.ndarray) and len(part) == 2]
+    parts = [part for part in pair if isinstance(part, tuple | list) or (isinstance(part, np.ndarray) and part.ndim)]
+    parts = [part for part in parts if len(part) == 2]
     if len(parts) < 2 or any(hasattr(entry, "__len__") for part in parts for entry in part):
         return False
     return not isinstance(pair, tuple) or all(isinstance(part, tuple) for part in parts)

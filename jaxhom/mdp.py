@@ -404,7 +404,7 @@ def _replacement(mdp: MDP, name: str, new) -> jax.Array:
         checks.require_shape(name, new, str(old.shape), good)
         return jnp.asarray(new, old.dtype)
     if name == "discount":
-        return jnp.asarray(checks.require_discount(new, old.dtype))
+        return jnp.asarray(np.asarray(checks.require_discount(new, old.dtype)))
     allowed = np.asarray(mdp.allowed)
     if name == "features":
         return jnp.asarray(_validated_features(new, allowed, old.dtype), old.dtype)

@@ -27,13 +27,19 @@ JOBS = {
 _STARTED = 0.3  # seconds by which Python itself has started, so that the library is there to answer
 
 
+_WATCH = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+
+
+def watching(*arguments) -> list[str]:
+    """A command for Python that watches for Ctrl-C, even where its parent runs in the background and ignores it."""
+    return [sys.executable, "-ISc", _WATCH, sys.executable, *arguments]
+
+
 def start(arguments, **options) -> subprocess.Popen:
-    """The command line, watching for Ctrl-C even where its parent runs in the background and ignores it."""
-    command = [sys.executable, "-m", "jaxhom", *arguments]
+    """The command line, watching for Ctrl-C."""
     options["env"] = {**os.environ, "PYTHONPATH": str(ROOT), **options.get("env", {})}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    restore = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
-    return subprocess.Popen(command, **pipes, preexec_fn=restore, **options)
+    return subprocess.Popen(watching("-m", "jaxhom", *arguments), **pipes, **options)
 
 
 def interrupt(arguments, seconds: float, folder) -> str:

@@ -285,7 +285,7 @@ FEATURES = MODEL + "--features states "
             "fickle_passenger=True, which its table P does n",
         ),
         (
-            "--mdp model.npz --demonstrations from1.csv --output out",
+            "--mdp model.npz --demonstrations from1.csv --impossible refuse --output out",
             "from1.csv: 1 of 2 steps have probability 0 in this model; the first is trajectory 0, step 0: "
             "state 1, action 1, then state 8",
         ),

@@ -2,11 +2,11 @@
 
 import os
 import signal
-import subprocess
 import sys
 import time
 import warnings
 
+import interrupt_often
 import numpy as np
 import oracles
 import pytest
@@ -304,10 +304,7 @@ def test_an_interruption_keeps_what_is_finished(files, monkeypatch, capsys, outp
 def test_a_signal_interrupts(files):
     """The real thing, in a process of its own: LPAL is asked for more than there is and would take its 500 columns."""
     hard = ["--method", "maximum-entropy", "--features", "states", "--lpal", "--lpal-tolerance", "1e-300"]
-    command = [sys.executable, "-m", "jaxhom", "learn", *files.options(), *hard]
-    restore = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731  # the tests may run in the background
-    pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, preexec_fn=restore, **pipes) as process:
+    with interrupt_often.start(["learn", *files.options(), *hard]) as process:
         deadline = time.monotonic() + 120
         while not files["out/generalization.npz"].exists() and time.monotonic() < deadline:
             time.sleep(0.02)

@@ -27,6 +27,17 @@ def as_host_array(name: str, value) -> np.ndarray:
         raise ValueError(f"{name} is not a rectangular array: {reason}") from None
 
 
+def to_device(array, dtype=None) -> jax.Array:
+    """A JAX array of its own memory; float64 is float32 unless x64 is on.
+
+    `jnp.asarray` compiles a program for every new shape of NumPy arrays, which takes longer than most of what is done
+    with them; arrays of JAX and traced ones it takes as they are, and so does this.
+    """
+    if isinstance(array, jax.Array):
+        return array if dtype is None else array.astype(dtype)
+    return jax.device_put(np.array(array, dtype))
+
+
 def is_traced(*trees) -> bool:
     """True if any leaf of the given pytrees is a traced value (host checks are then impossible)."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))

@@ -95,7 +95,7 @@ class Demonstrations:
             final_states[i] = row_states[length] if len(row_states) > length else -1
         arrays = {"states": states, "actions": actions, "mask": mask}
         arrays |= {"terminated": terminated, "final_states": final_states}
-        return cls(**{name: jnp.asarray(array) for name, array in arrays.items()})
+        return cls(**{name: checks.to_device(array) for name, array in arrays.items()})
 
     @property
     def num_trajectories(self) -> int:

@@ -188,7 +188,7 @@ def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: ja
     mdp = as_model(mdp)
     policy = require_policy_shape(mdp, policy)
     expert_policy = require_policy_shape(mdp, expert_policy, "expert_policy")
-    weights = jnp.ones(mdp.num_states, mdp.dtype) if weights is None else jnp.asarray(weights)
+    weights = jnp.ones(mdp.num_states, mdp.dtype) if weights is None else checks.to_device(weights)
     good = weights.ndim in (1, 2) and weights.shape[-1] == mdp.num_states
     checks.require_shape("weights", weights, f"({mdp.num_states},) or (B, {mdp.num_states})", good)
     if not checks.is_traced(weights):
@@ -282,11 +282,11 @@ def _validated(mdp: MDP, policy, reward, terminal, events):
     policy = require_policy_shape(mdp, policy)
     reward = check_reward(mdp, reward, policy.shape)
     pair = (mdp.num_states, mdp.num_actions)
-    terminal = jnp.zeros(pair[:1], bool) if terminal is None else jnp.asarray(terminal)
+    terminal = jnp.zeros(pair[:1], bool) if terminal is None else checks.to_device(terminal)
     checks.require_shape("terminal", terminal, str(pair[:1]), terminal.shape == pair[:1])
     if terminal.dtype != bool:
         raise ValueError(f"terminal must be bool, got dtype {terminal.dtype}")
-    events = {name: jnp.asarray(event, mdp.dtype) for name, event in (events or {}).items()}
+    events = {name: checks.to_device(event, mdp.dtype) for name, event in (events or {}).items()}
     for name, event in events.items():
         checks.require_shape(f"events[{name!r}]", event, str(pair), event.shape == pair)
     return check_policy(mdp, policy), reward, terminal, events

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom import evidence
+from jaxhom import checks, evidence
 from jaxhom.demonstrations import Demonstrations
 from jaxhom.explainers import LEAST_SHARE, ByGlobalMap
 from jaxhom.generalization import Generalization, maximum_entropy
@@ -65,11 +65,11 @@ def soft_homomorphism(
     policy, is_found = evidence.policy_of_votes(mdp, mapping @ np.asarray(start.policy)[experts])
     visited = start.visited
     return start.replace(
-        policy=jnp.where(visited[:, None], start.policy, jnp.asarray(policy, mdp.dtype)),
+        policy=jnp.where(visited[:, None], start.policy, checks.to_device(policy, mdp.dtype)),
         radius=jnp.where(visited, 0, np.where(is_found, 1, -1)).astype(jnp.int32),
         support=jnp.where(visited, 1, np.where(is_found, (mapping > LEAST_SHARE).sum(axis=1), 0)).astype(jnp.int32),
-        error_lower=jnp.asarray(lower, mdp.dtype),
-        error_upper=jnp.asarray(upper, mdp.dtype),
+        error_lower=checks.to_device(lower, mdp.dtype),
+        error_upper=checks.to_device(upper, mdp.dtype),
         explainer=ByGlobalMap(mdp, experts, mapping, float(lower), float(upper), anchored),
     )
 
@@ -79,7 +79,7 @@ def _problem(mdp: MDP, experts: np.ndarray, anchored: bool) -> GlobalHomomorphis
     if anchored:
         pinned[experts, np.arange(len(experts))] = True
     return GlobalHomomorphismProblem(
-        mdp=mdp, restricted=jnp.asarray(restricted_model(mdp, experts)), pinned=jnp.asarray(pinned)
+        mdp=mdp, restricted=checks.to_device(restricted_model(mdp, experts)), pinned=checks.to_device(pinned)
     )
 
 

@@ -45,7 +45,7 @@ def check_policy(mdp: MDP, policy, name: str = "policy", *, batch: bool = True) 
     host = checks.require_distribution(name, np.asarray(policy))
     if mdp.restricts_actions:
         checks.require_all(name, host, (host == 0) | np.asarray(mdp.allowed), "is an action that is not allowed there")
-    return jnp.asarray(host, mdp.dtype)
+    return checks.to_device(host, mdp.dtype)
 
 
 def require_policy_shape(mdp: MDP, policy, name: str = "policy", *, batch: bool = True):
@@ -95,7 +95,7 @@ def check_reward_values(mdp: MDP, reward, *, forbidden: float = 0.0, may_forbid:
             host = np.where(np.asarray(mdp.allowed), host, 0)
         minus = (host == -np.inf) if may_forbid and host.dtype.kind == "f" else np.zeros(host.shape, bool)
         finite = checks.require_floats_in(mdp.dtype, "reward", np.where(minus, 0, host))
-        reward = jnp.asarray(np.where(minus, -np.inf, finite), mdp.dtype)
+        reward = checks.to_device(np.where(minus, -np.inf, finite), mdp.dtype)
     if mdp.restricts_actions and reward.shape[-2:] == (mdp.num_states, mdp.num_actions):
         reward = jnp.where(mdp.allowed, reward, forbidden)
     return reward

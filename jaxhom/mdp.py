@@ -146,7 +146,7 @@ class MDP:
     @classmethod
     def _assemble(cls, next_state, probability, discount, initial, features, allowed) -> "MDP":
         num_states, _, width = next_state.shape
-        dtype = jnp.asarray(probability[:1, :1]).dtype  # float64 becomes float32 unless x64 is on
+        dtype = checks.to_device(probability[:1, :1]).dtype  # float64 becomes float32 unless x64 is on
         if initial is None:
             initial = np.full(num_states, 1.0 / num_states)
         initial = checks.as_host_array("initial", initial)
@@ -163,21 +163,21 @@ class MDP:
             wide_pairs = np.flatnonzero(counts > slots).astype(np.int32)
             lists = next_state.reshape(-1, width)[wide_pairs]
             if len(lists) and (lists == lists[0]).all():
-                wide_successors = jnp.asarray(lists[0], jnp.int32)
+                wide_successors = checks.to_device(lists[0], jnp.int32)
             entry = np.flatnonzero(probability > 0)
             predecessors = pad_rows(entry, next_state.ravel()[entry], num_states, next_state.size)
             edges = find_edges(next_state, probability)
         return cls(
-            next_state=jnp.asarray(next_state, jnp.int32),
-            probability=jnp.asarray(probability, dtype),
-            initial=jnp.asarray(initial, dtype),
-            features=jnp.asarray(features, dtype),
-            discount=jnp.asarray(discount, dtype),
-            allowed=jnp.asarray(allowed),
-            wide_pairs=jnp.asarray(wide_pairs),
+            next_state=checks.to_device(next_state, jnp.int32),
+            probability=checks.to_device(probability, dtype),
+            initial=checks.to_device(initial, dtype),
+            features=checks.to_device(features, dtype),
+            discount=checks.to_device(discount, dtype),
+            allowed=checks.to_device(allowed),
+            wide_pairs=checks.to_device(wide_pairs),
             wide_successors=wide_successors,
-            predecessors=jax.tree.map(jnp.asarray, predecessors),
-            edges=jax.tree.map(jnp.asarray, edges),
+            predecessors=jax.tree.map(checks.to_device, predecessors),
+            edges=jax.tree.map(checks.to_device, edges),
             narrow_width=slots,
             restricts_actions=not allowed.all(),
         )
@@ -209,10 +209,10 @@ class MDP:
         """The model with fewer actions."""
         allowed = _validated_allowed(allowed, self.allowed.shape)
         checks.require_all("allowed", allowed, ~allowed | np.asarray(self.allowed), "is a pair without transitions")
-        keep = jnp.asarray(allowed)[..., None]
+        keep = checks.to_device(allowed)[..., None]
         return dataclasses.replace(
             self,
-            allowed=jnp.asarray(allowed),
+            allowed=checks.to_device(allowed),
             probability=jnp.where(keep, self.probability, 0.0),
             features=jnp.where(keep, self.features, 0.0),
             restricts_actions=not allowed.all(),
@@ -404,19 +404,19 @@ def _replacement(mdp: MDP, name: str, new) -> jax.Array:
         checks.require_shape(name, new, str(old.shape), good)
         return jnp.asarray(new, old.dtype)
     if name == "discount":
-        return jnp.asarray(np.asarray(checks.require_discount(new, old.dtype)))
+        return checks.to_device(checks.require_discount(new, old.dtype))
     allowed = np.asarray(mdp.allowed)
     if name == "features":
-        return jnp.asarray(_validated_features(new, allowed, old.dtype), old.dtype)
+        return checks.to_device(_validated_features(new, allowed, old.dtype), old.dtype)
     new = checks.as_host_array(name, new)
     checks.require_shape(name, new, str(old.shape), new.shape == old.shape)
     if name == "initial":
-        return jnp.asarray(checks.require_distribution(name, new), old.dtype)
+        return checks.to_device(checks.require_distribution(name, new), old.dtype)
     new = checks.require_distribution(name, new, allowed if mdp.restricts_actions else None)
     if not mdp.is_dense:
         was_there = np.asarray(old) > 0
         checks.require_all(name, new, (new == 0) | was_there, "is a successor that the model did not have")
-    return jnp.asarray(new, old.dtype)
+    return checks.to_device(new, old.dtype)
 
 
 def _validated_allowed(allowed, shape: tuple[int, int]) -> np.ndarray:

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.chain_solver import solve_chain
 from jaxhom.host_chains import host_model, is_at_hand
 from jaxhom.inputs import as_model, check_policy, check_reward, require_policy_shape
@@ -138,4 +139,4 @@ def _solve_at_hand(mdp: MDP, policy: jax.Array, source: jax.Array, *, transpose:
     for lane in left if model.is_solvable else ():
         chain = model.chain(policies[lane])
         solutions[lane] = (chain.state_occupancy if transpose else chain.value)(sources[lane].astype(np.float64))
-    return jnp.asarray(solutions.reshape(policy.shape[:-1]), mdp.dtype)
+    return checks.to_device(solutions.reshape(policy.shape[:-1]), mdp.dtype)

@@ -63,10 +63,10 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
     policy, _ = evidence.policy_of_votes(mdp, np.where(occurs[:, None], x, 0.0))
     found = np.where(occurs, 1, -1)
     return Generalization(
-        policy=jnp.asarray(np.where(visited[:, None], empirical, policy), mdp.dtype),
-        visited=jnp.asarray(visited),
-        radius=jnp.asarray(np.where(visited, 0, found), jnp.int32),
-        support=jnp.asarray(np.where(visited, 1, decides.sum() * occurs), jnp.int32),
+        policy=checks.to_device(np.where(visited[:, None], empirical, policy), mdp.dtype),
+        visited=checks.to_device(visited),
+        radius=checks.to_device(np.where(visited, 0, found), jnp.int32),
+        support=checks.to_device(np.where(visited, 1, decides.sum() * occurs), jnp.int32),
         explainer=ByOccupancy(x, int(decides.sum())),
     )
 

@@ -111,7 +111,7 @@ def optimal_policy(
     reward, is_batch = _reward_batch(mdp, reward)
     if initial_value is None:
         initial_value = jnp.zeros((reward.shape[0], mdp.num_states), mdp.dtype)
-    initial_value = jnp.asarray(initial_value, mdp.dtype)
+    initial_value = checks.to_device(initial_value, mdp.dtype)
     if initial_value.shape == (mdp.num_states,):
         initial_value = jnp.broadcast_to(initial_value, (reward.shape[0], mdp.num_states))
     good = initial_value.shape == (reward.shape[0], mdp.num_states)
@@ -119,7 +119,7 @@ def optimal_policy(
     is_default = tolerance is None
     if is_default:
         tolerance = (1e-10 if mdp.dtype == jnp.float64 else 1e-5) * _scale(reward)
-    tolerance = jnp.broadcast_to(jnp.asarray(tolerance, mdp.dtype), reward.shape[:1])
+    tolerance = jnp.broadcast_to(checks.to_device(tolerance, mdp.dtype), reward.shape[:1])
     inputs = jax.lax.stop_gradient((mdp, jnp.moveaxis(reward, 0, -1), initial_value.T, tolerance))
     if is_at_hand(inputs):
         plan = _plan_at_hand(*inputs, max_iterations=max_iterations, is_polished=is_default)
@@ -231,8 +231,8 @@ def _improve_on_host(model, reward: np.ndarray, plan: Plan, start: np.ndarray, l
         iterations[lane] += found.iterations
         limited = Status.ITERATION_LIMIT if found.iterations >= left else Status.STALLED
         status[lane] = Status.SOLVED if found.is_settled else limited
-    arrays = {name: jnp.asarray(array, dtype) for name, array in fields.items()}
-    return plan.replace(**arrays, iterations=jnp.asarray(iterations), status=jnp.asarray(status))
+    arrays = {name: checks.to_device(array, dtype) for name, array in fields.items()}
+    return plan.replace(**arrays, iterations=checks.to_device(iterations), status=checks.to_device(status))
 
 
 @functools.partial(jax.jit, static_argnames=("max_iterations", "is_quick"))

@@ -171,7 +171,7 @@ def _reward(mdp: MDP, reward: np.ndarray) -> jax.Array:
     good = reward.shape in ((states,), (states, actions))
     checks.require_shape("reward", reward, f"({states}, {actions}) or ({states},)", good)
     reward = checks.require_floats_in(mdp.dtype, "reward", reward)
-    return jnp.broadcast_to(jnp.asarray(reward.reshape(states, -1)), (states, actions))
+    return jnp.broadcast_to(checks.to_device(reward.reshape(states, -1)), (states, actions))
 
 
 def _coordinates(mdp: MDP, coordinates: np.ndarray) -> np.ndarray:
@@ -241,7 +241,7 @@ def _sample(problem: Problem, options) -> Demonstrations:
     if problem.terminal is None:
         return samples
     if np.asarray(absorbing_states(problem.mdp))[problem.terminal].all():
-        ends = jnp.asarray(problem.terminal)
+        ends = checks.to_device(problem.terminal)
         return sample_demonstrations(key, problem.mdp, problem.plan.policy, options.expert, steps, terminal=ends)
     ended = np.cumsum(problem.terminal[np.asarray(samples.states)], axis=1) > 0
     lengths = (~ended).sum(axis=1)  # at least 1: no episode starts in a terminal state

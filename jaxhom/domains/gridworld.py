@@ -102,8 +102,8 @@ def gridworld(
     )
     return Gridworld(
         mdp=mdp,
-        coordinates=jnp.asarray(coordinates, jnp.int32),
-        region=jnp.asarray(region, jnp.int32),
+        coordinates=checks.to_device(coordinates, jnp.int32),
+        region=checks.to_device(region, jnp.int32),
         size=size,
     )
 

@@ -157,12 +157,12 @@ def racetrack(
     )
     return Racetrack(
         mdp=mdp,
-        weights=jnp.asarray(_WEIGHTS, mdp.dtype),
-        cells=jnp.asarray(cells, jnp.int32),
-        speeds=jnp.asarray(_SPEEDS, jnp.int32),
-        coordinates=jnp.asarray(np.repeat(cells, 25, axis=0), jnp.int32),
-        terminal=jnp.asarray(terminal),
-        off_road=jnp.asarray(events[..., _OFF_ROAD], mdp.dtype),
+        weights=checks.to_device(_WEIGHTS, mdp.dtype),
+        cells=checks.to_device(cells, jnp.int32),
+        speeds=checks.to_device(_SPEEDS, jnp.int32),
+        coordinates=checks.to_device(np.repeat(cells, 25, axis=0), jnp.int32),
+        terminal=checks.to_device(terminal),
+        off_road=checks.to_device(events[..., _OFF_ROAD], mdp.dtype),
         rows=rows,
     )
 

@@ -22,7 +22,6 @@ import warnings
 from collections.abc import Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
@@ -110,8 +109,8 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
         features=features,
         allowed=None if allowed.all() else allowed,
     )
-    reward = jnp.asarray(checks.require_floats_in(mdp.dtype, "expected reward", reward))
-    return GymnasiumModel(mdp=mdp, reward=reward, terminal=jnp.asarray(terminal))
+    reward = checks.to_device(checks.require_floats_in(mdp.dtype, "expected reward", reward))
+    return GymnasiumModel(mdp=mdp, reward=reward, terminal=checks.to_device(terminal))
 
 
 def make_environment(name: str, **options):

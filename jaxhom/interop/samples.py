@@ -125,9 +125,9 @@ def from_samples(
     shape = (num_states, num_actions)
     return SampledModel(
         mdp=mdp,
-        count=jnp.asarray(count.reshape(shape), jnp.int32),
-        expected_l1_error=jnp.asarray(l1.reshape(shape), mdp.dtype),
-        standard_deviation=jnp.asarray(np.sqrt(square).reshape(shape), mdp.dtype),
+        count=checks.to_device(count.reshape(shape), jnp.int32),
+        expected_l1_error=checks.to_device(l1.reshape(shape), mdp.dtype),
+        standard_deviation=checks.to_device(np.sqrt(square).reshape(shape), mdp.dtype),
     )
 
 

@@ -132,12 +132,12 @@ def _solve(mdp: MDP, expectations: np.ndarray, initial_policy, tolerance, method
     features = np.asarray(mdp.features)
     unit = float(np.exp2(np.floor(np.log2(np.abs(features).max() or 1.0))))  # a power of two changes no digit
     certify = Certifier(mdp, expectations, tolerance, reduction, unit)
-    scaled = (
-        mdp if unit == 1.0 else dataclasses.replace(mdp, features=jnp.asarray(features / features.dtype.type(unit)))
-    )
+    scaled = mdp
+    if unit != 1.0:
+        scaled = dataclasses.replace(mdp, features=checks.to_device(features / features.dtype.type(unit)))
     goal = tolerance / unit if mdp.dtype == jnp.float64 else _FLOAT32_GOAL * tolerance / unit
     found = method(scaled, reduction.expectations / unit, initial_policy, goal, certify, **options)
-    return jax.tree.map(jnp.asarray, found)
+    return jax.tree.map(checks.to_device, found)
 
 
 def _checked_expectations(mdp: MDP, expectations) -> np.ndarray:

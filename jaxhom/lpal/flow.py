@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jaxhom import checks
 from jaxhom.lpal.certificate import (
     Found,
     LPALSolution,
@@ -51,9 +52,9 @@ def solve_by_flow(
 ) -> LPALSolution:
     """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None."""
     limit = DEFAULT_ITERATIONS if max_iterations is None else max_iterations
-    expectations, tolerance = jnp.asarray(expectations, mdp.dtype), jnp.asarray(tolerance, mdp.dtype)
+    expectations, tolerance = checks.to_device(expectations, mdp.dtype), checks.to_device(tolerance, mdp.dtype)
     problem = _make_problem(mdp, expectations)
-    first = uniform_policy(mdp) if initial_policy is None else jnp.asarray(initial_policy, mdp.dtype)
+    first = uniform_policy(mdp) if initial_policy is None else checks.to_device(initial_policy, mdp.dtype)
     state = _start(problem, jnp.broadcast_to(first, (len(expectations), mdp.num_states, mdp.num_actions)))
     bound = best = None
     value = jnp.zeros((len(expectations), mdp.num_states), mdp.dtype)
@@ -93,10 +94,10 @@ def _make_problem(mdp: MDP, expectations: jax.Array) -> FlowProblem:
     expected = (1.0 - mdp.discount) / jnp.asarray(unit, mdp.dtype)[:, None] * expectations.T
     return FlowProblem(
         mdp=mdp,
-        features=jnp.asarray(scaled, mdp.dtype),
+        features=checks.to_device(scaled, mdp.dtype),
         expectations=expected,
         projection=projection,
-        share=None if (unit == unit[0]).all() else jnp.asarray(unit.min() / unit, mdp.dtype),
+        share=None if (unit == unit[0]).all() else checks.to_device(unit.min() / unit, mdp.dtype),
     )
 
 

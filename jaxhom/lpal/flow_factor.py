@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
+from jaxhom import checks
 from jaxhom.block_tridiagonal import BlockCholesky, order_in_blocks
 from jaxhom.mdp import MDP
 from jaxhom.normal_equations import flow_matrix
@@ -41,9 +42,9 @@ def factor_flow(mdp: MDP, features: np.ndarray) -> FlowProjection:
     lower, diagonal = factor.unit_factor()
     arrays = {"lower": lower, "diagonal": diagonal, "behind": behind, "schur": np.linalg.inv(schur)}
     return FlowProjection(
-        order=jnp.asarray(np.concatenate([blocks.order, padding]), jnp.int32),
-        place=jnp.asarray(blocks.place, jnp.int32),
-        **{name: jnp.asarray(array, mdp.dtype) for name, array in arrays.items()},
+        order=checks.to_device(np.concatenate([blocks.order, padding]), jnp.int32),
+        place=checks.to_device(blocks.place, jnp.int32),
+        **{name: checks.to_device(array, mdp.dtype) for name, array in arrays.items()},
     )
 
 

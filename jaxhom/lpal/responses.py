@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.chain_solver import rough_state_occupancy
 from jaxhom.lpal.certificate import bound_by_planning, simplex_point
 from jaxhom.lpal.exact import Exact, compact_features, exact_rows
@@ -15,7 +16,7 @@ from jaxhom.mdp import MDP
 def with_compact_features(mdp: MDP) -> MDP:
     """The model with features [S, 1, K] where they do not depend on the action: a quarter of the numbers, with four."""
     features = compact_features(np.asarray(mdp.features), np.asarray(mdp.allowed))
-    return mdp if features.shape[1] > 1 else dataclasses.replace(mdp, features=jnp.asarray(features))
+    return mdp if features.shape[1] > 1 else dataclasses.replace(mdp, features=checks.to_device(features))
 
 
 @jax.jit

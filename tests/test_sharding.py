@@ -20,7 +20,8 @@ np.save({path!r}, np.stack([found.lower, found.upper]))
 
 
 def run(path, devices):
-    environment = {**os.environ, "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+    environment = {**os.environ, "XLA_FLAGS": flags}
     program = PROGRAM.format(devices=devices, path=str(path))
     subprocess.run([sys.executable, "-c", program], check=True, env=environment, timeout=240)
 

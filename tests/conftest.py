@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import small_models
 
-_MUCH = float(os.environ.get("JAXHOM_TESTS_BYTES", 1.0e9))  # from which on a process lets its programs go
+_much = float(os.environ.get("JAXHOM_TESTS_BYTES", 1.3e9))  # from which on a process lets its programs go
 
 jax.config.update("jax_enable_x64", True)
 
@@ -41,13 +41,18 @@ def rng():
     return np.random.default_rng(0)
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def compiled_programs_leave():
-    """Compiled programs of former files add up to gigabytes: they go where a process has become large."""
+    """Compiled programs add up to gigabytes: they go where a process has become large, and larger than it was after."""
     yield
+    global _much
+    if _resident() > _much:
+        jax.clear_caches()
+        gc.collect()
+        _much = max(_much, 1.25 * _resident())
+
+
+def _resident() -> int:
+    """Bytes of this process in memory; 0 where nobody says."""
     statistics = pathlib.Path("/proc/self/statm")
-    if statistics.exists():
-        resident = int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        if resident > _MUCH:
-            jax.clear_caches()
-            gc.collect()
+    return int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statistics.exists() else 0

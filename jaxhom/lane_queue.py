@@ -110,7 +110,8 @@ class _Queue:
     def __init__(self, problem, threshold, keep: Sequence[str] | None):
         self.problem = jax.tree.map(np.asarray, problem)
         self.total = jax.tree.leaves(self.problem)[0].shape[-1]
-        self.limits = None if threshold is None else np.broadcast_to(threshold, (self.total,))
+        # NaN decides nothing: with a threshold and without, it is one program.
+        self.limits = np.broadcast_to(np.nan if threshold is None else threshold, (self.total,))
         self.results: dict[str, np.ndarray] = {}
         self._keep = keep
         self._waiting = 0
@@ -149,10 +150,9 @@ def _drain(queue: _Queue, solver: Solver, lanes: int, devices, tolerance, max_it
         source[: busy.size] = busy
         owner = np.resize(np.append(owner[busy], fresh), lanes)  # surplus lanes repeat the first
         batch = _shard(jax.tree.map(lambda leaf, owner=owner: leaf[..., owner], queue.problem), devices)
-        limit = None if queue.limits is None else queue.limits[owner]
         fresh_state = _init(solver, batch)
         state = fresh_state if state is None else _merge(state, fresh_state, source)
-        state, done = _run(solver, batch, state, limit, used, tolerance, max_iterations)
+        state, done = _run(solver, batch, state, queue.limits[owner], used, tolerance, max_iterations)
         done = np.asarray(done)[:used]
         busy, finished = np.flatnonzero(~done), np.flatnonzero(done)
         queue.store(state, finished, owner[finished])

@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxhom import outward
 from jaxhom.certified_maps import CertifiedMaps
 from jaxhom.pdhg import Status
 
@@ -106,7 +107,7 @@ def _numbers(row: np.ndarray) -> str:
 
 def _bracket(found: CertifiedMaps, pair: int) -> str:
     mark = "" if found.status[pair] == Status.SOLVED else " (stopped early)"
-    return f"{found.lower[pair]:.6g} <= e <= {found.upper[pair]:.6g}{mark}"
+    return outward.bracket(found.lower[pair], found.upper[pair]) + mark
 
 
 def _rows(found: CertifiedMaps, pair: int) -> list[str]:

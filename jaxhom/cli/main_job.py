@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jaxhom import outward
 from jaxhom.cli.methods import wants_progress
 from jaxhom.cli.options import Parser, count, positive
 from jaxhom.cli.pictures import load_plotting
@@ -59,8 +60,8 @@ class Row:
     def cells(self) -> tuple[str, ...]:
         """The row of the printed table."""
 
-        def show(value, pattern):
-            return "" if np.isnan(value) else format(value, pattern)
+        def show(value, pattern=None):
+            return "" if np.isnan(value) else format(value, pattern) if pattern else outward.at_most(value)
 
         return (
             self.method,
@@ -68,8 +69,8 @@ class Row:
             show(100 * self.relative, ".1f"),
             show(self.steps, ".1f"),
             show(self.off_roads, ".3f"),
-            show(self.loss_bound, ".1e"),
-            show(self.lpal_gap, ".1e"),
+            show(self.loss_bound),
+            show(self.lpal_gap),
         )
 
 

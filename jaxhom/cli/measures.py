@@ -17,19 +17,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom import outward
 from jaxhom.cli.sources import Problem
 from jaxhom.cli.tables import format_table
 from jaxhom.evaluation import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
 from jaxhom.occupancy import occupancy, policy_value
 
 _FORMATS = {
-    "value": ".5g",
-    "loss <=": ".1e",
-    "reward": ".5g",
-    "steps": ".1f",
-    "finished": ".3f",
-    "off-roads/step": ".3f",
+    "value": "{:.5g}".format,
+    "loss <=": outward.at_most,
+    "reward": "{:.5g}".format,
+    "steps": "{:.1f}".format,
 }
+_SHARE = "{:.3f}".format
 _SHARES = ("all states", "where that goes")
 
 
@@ -48,7 +48,7 @@ class Measures:
     def _cell(self, name: str) -> str:
         if name not in self.numbers:
             return ""
-        text = format(self.numbers[name], _FORMATS.get(name, ".3f"))
+        text = _FORMATS.get(name, _SHARE)(self.numbers[name])
         return f"{text} ±{self.errors[name]:.1g}" if name in self.errors else text
 
     def as_json(self) -> dict:

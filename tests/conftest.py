@@ -5,6 +5,8 @@ next run find them, and are made with fewer passes: half the time, and the same 
 `JAXHOM_TESTS_AS_USERS=1` compiles as users do.
 """
 
+import contextlib
+import ctypes
 import gc
 import os
 import pathlib
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 import small_models
 
-_much = float(os.environ.get("JAXHOM_TESTS_BYTES", 1.3e9))  # from which on a process lets its programs go
+_MUCH = 1.3e9  # bytes of a process from which on it gives memory back
 
 jax.config.update("jax_enable_x64", True)
 
@@ -42,14 +44,21 @@ def rng():
 
 
 @pytest.fixture(autouse=True)
-def compiled_programs_leave():
-    """Compiled programs add up to gigabytes: they go where a process has become large, and larger than it was after."""
+def memory_is_given_back():
+    """What compiling leaves behind adds up to gigabytes, which the C library keeps until it is told to let go."""
     yield
-    global _much
-    if _resident() > _much:
+    if _resident() > _MUCH:
+        gc.collect()
+        _trim()
+    if _resident() > _MUCH:
         jax.clear_caches()
         gc.collect()
-        _much = max(_much, 1.25 * _resident())
+        _trim()
+
+
+def _trim():
+    with contextlib.suppress(OSError, AttributeError):  # not glibc
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def _resident() -> int:

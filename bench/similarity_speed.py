@@ -135,7 +135,7 @@ def section_brackets(quick: bool) -> list[dict]:
     for n in (3, 5) if quick else SIZES:
         count = 8 if quick else OUR_PAIRS[n]
         rows.append(our_pairs(n, count, "interior_point"))
-        if n <= MAX_PDHG_SIZE:
+        if n <= (3 if quick else MAX_PDHG_SIZE):
             rows += [our_pairs(n, count, "pdhg", dtype) for dtype in (np.float64, np.float32)]
     return rows
 

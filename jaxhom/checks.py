@@ -148,15 +148,23 @@ def require_discount(discount, dtype=np.float64) -> np.ndarray:
     return rounded
 
 
-def require_count(name: str, value) -> int:
-    """Returns `value` as an int of at least 1."""
+def require_count(name: str, value, least: int = 1) -> int:
+    """Returns `value` as an int of at least `least`."""
     try:
         value = operator.index(value)
     except TypeError:
         raise ValueError(f"{name} must be a whole number, got {in_one_line(value)}") from None
-    if value < 1:
-        raise ValueError(f"{name} must be at least 1, got {value}")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
     return value
+
+
+def require_positive(name: str, value, *, or_zero: bool = False) -> None:
+    """Raises unless a number, or every number of an array, is positive where it is concrete."""
+    if not is_traced(value):
+        numbers = require_floats(name, as_host_array(name, value))
+        good = (numbers > 0) | ((numbers == 0) & or_zero)
+        require_all(name, numbers, good, "must not be negative" if or_zero else "must be positive")
 
 
 def require_slots(num_states: int, num_actions: int, width: int) -> None:

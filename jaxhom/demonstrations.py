@@ -279,8 +279,8 @@ def sample_demonstrations(
     """
     mdp = as_model(mdp)
     policy = check_policy(mdp, policy, batch=False)
-    if num_trajectories < 1 or horizon < 1:
-        raise ValueError(f"num_trajectories and horizon must be at least 1, got {num_trajectories} and {horizon}")
+    num_trajectories = checks.require_count("num_trajectories", num_trajectories)
+    horizon = checks.require_count("horizon", horizon)
     if terminal is not None:
         terminal = _require_flags("terminal", jnp.asarray(terminal), mdp.num_states)
         if not checks.is_traced(terminal, mdp.initial):

@@ -54,7 +54,10 @@ class HostGraph:
         ones, first = np.ones(len(states), bool), np.arange(len(states) + 1)
         rows = scipy.sparse.csr_array((ones, states, first), shape=(len(states), self.num_states))
         for _ in range(steps):
+            known = rows.nnz
             rows = rows @ self.adjacency  # of booleans: "or", which does not overflow
+            if rows.nnz == known:
+                break  # everything that can be reached
         rows.sort_indices()
         return rows
 

@@ -20,6 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom.programs import host_jit
+
 _STOP_FRACTION = 0.25
 _MAX_WORKERS = 8
 
@@ -170,18 +172,18 @@ def _shard(batch, devices: Sequence[jax.Device]):
     return jax.tree.map(put, batch)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(host_jit, static_argnums=0)
 def _init(solver: Solver, problem):
     return solver.init(problem)
 
 
-@jax.jit
+@host_jit
 def _merge(state, fresh, source):
     """Lanes of a former state where `source` names one, fresh ones where it is -1."""
     return jax.tree.map(lambda old, new: jnp.where(source >= 0, old[..., source], new), state, fresh)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(host_jit, static_argnums=0)
 def _run(solver: Solver, problem, state, threshold, used, tolerance, max_iterations):
     """Steps until a quarter of the `used` lanes are done; returns which."""
 

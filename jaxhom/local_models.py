@@ -216,8 +216,7 @@ def _quantum_bits(dtype) -> int:
 def _validated(mdp: MDP, states, distance: int) -> np.ndarray:
     if checks.is_traced(mdp):
         raise ValueError("local models are found on the host: call this outside jit, vmap and grad")
-    if distance < 1:
-        raise ValueError(f"distance must be at least 1, got {distance}")
+    checks.require_count("distance", distance)
     states = checks.as_host_array("states", states)
     checks.require_shape("states", states, "[P]", states.ndim == 1)
     return checks.require_integers("states", states, upper=mdp.num_states)

@@ -196,8 +196,7 @@ class MDP:
         Raises:
           ValueError: if another field is named, or a concrete array is not what the constructors would take.
         """
-        fields = {field.name for field in dataclasses.fields(self)}
-        if not hasattr(self.probability, "dtype") or not changes.keys() <= fields:  # descriptions, such as vmap's axes
+        if not hasattr(self.probability, "dtype"):  # a description, such as vmap's axes
             return dataclasses.replace(self, **changes)
         for name in changes:
             if name not in _REPLACEABLE:
@@ -389,7 +388,7 @@ def _scatter_dense(next_state, probability) -> np.ndarray:
 
 def _require_contraction(probability: np.ndarray, discount: np.ndarray) -> None:
     """Raises where a sum within the tolerance of 1 makes discounted sums diverge all the same."""
-    total = probability.sum(axis=-1, dtype=np.float64)
+    total = np.asarray(probability).sum(axis=-1, dtype=np.float64)
     message = f"is too far above 1 for a discount of {discount}"
     checks.require_all("sum of probability", total, total * np.float64(discount) < 1.0, message)
 
@@ -404,7 +403,9 @@ def _replacement(mdp: MDP, name: str, new) -> jax.Array:
         checks.require_shape(name, new, str(old.shape), good)
         return jnp.asarray(new, old.dtype)
     if name == "discount":
-        return checks.to_device(checks.require_discount(new, old.dtype))
+        new = checks.require_discount(new, old.dtype)
+        _require_contraction(mdp.probability, new)
+        return checks.to_device(new)
     allowed = np.asarray(mdp.allowed)
     if name == "features":
         return checks.to_device(_validated_features(new, allowed, old.dtype), old.dtype)
@@ -444,8 +445,9 @@ def _validated_features(features, allowed: np.ndarray, dtype) -> np.ndarray:
     expected = f"({num_states}, {num_actions}, K) or ({num_states}, K)"
     checks.require_shape("features", features, expected, by_state or by_pair)
     if by_pair and not allowed.all():
-        features = np.where(allowed[..., None], features, 0)
+        features = np.where(allowed[..., None], features, 0)  # whatever is there is not looked at
     features = checks.require_floats_in(dtype, "features", features)
     if by_pair:
         return features
-    return np.broadcast_to(features[:, None], (num_states, num_actions, features.shape[-1]))
+    features = np.broadcast_to(features[:, None], (num_states, num_actions, features.shape[-1]))
+    return features if allowed.all() else np.where(allowed[..., None], features, 0)

@@ -39,6 +39,7 @@ _SLOW = 0.5
 _MAX_IMPROVEMENTS = 100  # of policy iteration inside a program
 _MAX_UNROLLED_ACTIONS = 16
 _POLISHED_STATES = 20_000
+_VISIBLE = 0.01  # of the values: where rounding may have made more than that, float32 has no answer
 
 
 @chex.dataclass(frozen=True)
@@ -53,7 +54,8 @@ class Plan:
       value: [S], within residual / (1 - discount) of the optimal value.
       action_value: [S, A], r + gamma T value; -inf where an action is not allowed.
       iterations: int32 scalar, sweeps until the lane stopped, and policies of policy iteration.
-      residual: scalar, max_s |max_a action_value(s, a) - value(s)|, the Bellman residual.
+      residual: scalar, max_s |max_a action_value(s, a) - value(s)|, the Bellman residual; from float32 sweeps with
+        what rounding can hide from it.
       status: int32 scalar, a `jaxhom.Status`: SOLVED where the residual is within the tolerance or no action is better
         than the policy's. The bounds hold whatever it is.
     """
@@ -116,8 +118,11 @@ def optimal_policy(
         initial_value = jnp.broadcast_to(initial_value, (reward.shape[0], mdp.num_states))
     good = initial_value.shape == (reward.shape[0], mdp.num_states)
     checks.require_shape("initial_value", initial_value, f"(..., {mdp.num_states})", good)
+    max_iterations = checks.require_count("max_iterations", max_iterations, least=0)
     is_default = tolerance is None
-    if is_default:
+    if not is_default:
+        checks.require_positive("tolerance", tolerance, or_zero=True)
+    else:
         tolerance = (1e-10 if mdp.dtype == jnp.float64 else 1e-5) * _scale(reward)
     tolerance = jnp.broadcast_to(checks.to_device(tolerance, mdp.dtype), reward.shape[:1])
     inputs = jax.lax.stop_gradient((mdp, jnp.moveaxis(reward, 0, -1), initial_value.T, tolerance))
@@ -262,7 +267,14 @@ def _plan(mdp, reward, value, tolerance, *, max_iterations, is_quick) -> tuple[P
     rounding = _rounding(mdp, action_value)
     loss = action_value.max(axis=1, keepdims=True) - action_value
     is_open = ((loss > rounding) & (loss <= 2.0 * residual / (1.0 - mdp.discount))).any(axis=(0, 1))
-    tie_tolerance = jnp.maximum(4.0 * residual, rounding)
+    # A loss in every step adds up: it may not become a visible part of the value.
+    little = (1.0 - mdp.discount) * jnp.finfo(value.dtype).eps ** 0.5 * jnp.abs(action_value.max(axis=1, keepdims=True))
+    tie_tolerance = jnp.maximum(4.0 * residual, jnp.minimum(rounding, little))
+    if value.dtype != jnp.float64:
+        size = jnp.abs(value).max(axis=0)
+        hidden = _hidden_share(mdp, value.dtype)
+        residual += hidden * size
+        is_solved &= hidden <= _VISIBLE * (1.0 - mdp.discount)
     plan = Plan(
         policy=greedy_policy(jnp.moveaxis(action_value, -1, 0), jnp.moveaxis(tie_tolerance, -1, 0)),
         value=value.T,
@@ -404,6 +416,16 @@ def _sweeps(mdp: MDP, reward: jax.Array) -> tuple[Callable, ...]:
         return r + sum(w * value[states] for w, states in zip(weight, chains.successor, strict=True))
 
     return improve, best_action, follow, evaluate
+
+
+def _hidden_share(mdp: MDP, dtype) -> jax.Array:
+    """The share of the values by which a backup in this type may be off without seeing it.
+
+    Rows sum to 1 up to a rounding, and their products with the values are rounded. Discounted sums make that
+    1 / (1 - discount) times as much.
+    """
+    total = mdp.probability.sum(axis=-1)
+    return jnp.where(total > 0.5, jnp.abs(total - 1.0), 0.0).max() + 0.5 * jnp.finfo(dtype).eps
 
 
 def _rounding(mdp: MDP, action_value: jax.Array) -> jax.Array:

@@ -97,11 +97,15 @@ def _finish(model: HostModel, reward, best, eps: float, is_settled: bool) -> Hos
 
 
 def _tie_tolerance(model: HostModel, reward, value, action_value, eps: float) -> np.ndarray:
-    """[S, A]: the loss against the best action that rounding can have made."""
+    """[S, A]: the loss against the best action that rounding can have made: the work's, in float64, and the model's.
+
+    A loss in every step adds up to 1 / (1 - discount) of it: what the model's type hides is counted in the sum.
+    """
     size = np.where(np.isfinite(reward), np.abs(reward), 0.0) + _spread(model, value)
     best = action_value.argmax(axis=1)[:, None]
     size = size + np.take_along_axis(size, best, axis=1)
     top = np.abs(np.take_along_axis(action_value, best, axis=1))
+    eps = max(eps * (1.0 - model.discount), np.finfo(float).eps)
     return _ROUNDINGS * eps * size + _ROUNDINGS_OF_VALUES * np.finfo(float).eps * top
 
 

@@ -19,6 +19,7 @@ ROWS = {
     "status": -1,  # how an answer ended
     "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
     "outward": -1,
+    "programs": -1,
     "canonical_forms": -1,  # arrays in, keys out
     "first_order": -1,  # a value in, the same value out
     "padded_rows": -1,  # arrays in, arrays out

@@ -388,8 +388,8 @@ def test_one_state_and_one_step():
     [
         ((7, 2), 1, 1, r"policy must have shape .*, got \(7, 2\)"),
         ((2, 7, 3), 1, 1, r"policy must have shape .*, got \(2, 7, 3\)"),
-        ((7, 3), 0, 1, "num_trajectories and horizon must be at least 1, got 0 and 1"),
-        ((7, 3), 1, 0, "num_trajectories and horizon must be at least 1, got 1 and 0"),
+        ((7, 3), 0, 1, "num_trajectories must be at least 1, got 0"),
+        ((7, 3), 1, 0, "horizon must be at least 1, got 0"),
     ],
 )
 def test_sampling_refuses(policy_shape, num_trajectories, horizon, message):

@@ -9,7 +9,7 @@ import oracles
 import pytest
 
 import jaxhom
-from jaxhom import MDP, Demonstrations, monte_carlo_feature_expectations
+from jaxhom import MDP, Demonstrations, interop, monte_carlo_feature_expectations
 
 RIGHT = [1, 1, 1]
 
@@ -159,3 +159,21 @@ def test_sampled_episodes_that_stop_at_the_goal_or_walk_on_in_it():
     assert np.all(cut.terminated) and not np.any(walked.terminated)
     both = (monte_carlo_feature_expectations(mdp, demonstrations) for demonstrations in (cut, walked))
     np.testing.assert_allclose(*both, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["timeouts", "truncations", "truncated"])
+def test_an_episode_with_both_flags_was_cut_off(name):
+    ends = [False, False, True]
+    episode = {"observations": [0, 1, 0], "actions": [0, 0, 0], "dones": ends}
+    read = interop.demonstrations_from_episodes
+    assert read([episode])[0].terminated.tolist() == [True]
+    assert read([episode | {name: ends}])[0].terminated.tolist() == [False]
+    assert read([episode | {"infos": [{}, {}, {"TimeLimit.truncated": True}]}])[0].terminated.tolist() == [False]
+    for infos in (3, {"a": 1}, [], None):
+        assert read([episode | {"infos": infos}])[0].terminated.tolist() == [True]
+
+
+@pytest.mark.parametrize("flag", ["no", float("nan"), 2])
+def test_flags_that_are_none_are_refused(flag):
+    with pytest.raises(ValueError, match="episode 0: terminal.* must be"):
+        interop.demonstrations_from_episodes([{"obs": [0, 1], "acts": [0], "terminal": flag}])

@@ -106,7 +106,7 @@ def test_no_states_at_all():
     assert len(local_model_classes(mdp, []).label) == 0
 
 
-@pytest.mark.parametrize("distance", [1, 30])
+@pytest.mark.parametrize("distance", [1, 30, 10**9])
 def test_a_distance_beyond_the_model_gives_the_model(distance):
     transition = MODELS["dense"]()
     models = local_models(as_mdp(transition), np.arange(7), distance)

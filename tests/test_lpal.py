@@ -380,7 +380,7 @@ def test_initial_policies_that_do_not_fit_are_refused(initial_policy, message):
     [
         ({"method": "simplex"}, r"method must be one of .*, got 'simplex'"),
         ({"tolerance": 0.0}, "tolerance must be positive, got 0.0"),
-        ({"tolerance": np.nan}, "tolerance must be positive, got nan"),
+        ({"tolerance": np.nan}, "tolerance must be finite, got nan"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message):

@@ -152,7 +152,7 @@ def test_replace_serves_descriptions_of_models_and_refuses_unknown_names():
     """Such as the axes of a vmap, whose leaves are no arrays."""
     mdp = small_models.case("dense").mdp
     assert jax.tree.map(lambda _: None, mdp).replace(discount=0).discount == 0
-    with pytest.raises(TypeError, match="reward"):
+    with pytest.raises(ValueError, match="reward cannot be replaced"):
         mdp.replace(reward=0.0)
 
 
@@ -408,3 +408,19 @@ def test_oracle_models_keep_their_zeros(rng):
     mdp = MDP.from_dense(transition, discount=discount)
     chex.assert_shape(mdp.probability, (40, 3, 4))
     np.testing.assert_array_equal(np.asarray(mdp.transition) > 0, transition > 0)
+
+
+def test_replacing_the_discount_asks_what_the_constructor_asks():
+    """Rows within a few roundings of 1 are kept; with a discount nearer to 1 than that, sums would diverge."""
+    transition = (np.full((3, 1, 3), 1 / 3) * (1 + 9e-7)).astype(np.float32)
+    with pytest.raises(ValueError, match=r"too far above 1 for a discount of 0\.9999995"):
+        MDP.from_dense(transition, discount=0.9999995)
+    mdp = MDP.from_dense(transition, discount=0.9)
+    with pytest.raises(ValueError, match=r"too far above 1 for a discount of 0\.9999995"):
+        mdp.replace(discount=0.9999995)
+
+
+def test_features_of_states_are_zero_where_an_action_does_not_exist():
+    allowed = np.array([[True, False], [True, True]])
+    mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.9, features=np.ones((2, 3)), allowed=allowed)
+    np.testing.assert_array_equal(np.asarray(mdp.features), np.broadcast_to(allowed[..., None], (2, 2, 3)))

@@ -383,3 +383,50 @@ def test_rewards_of_another_shape_are_refused(shape):
 def test_initial_values_of_another_shape_are_refused(shape):
     with pytest.raises(ValueError, match=r"initial_value must have shape \(\.\.\., 7\), got"):
         optimal_policy(small_models.case("dense").mdp, np.zeros((2, 7)), initial_value=np.zeros(shape))
+
+
+@pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["concrete", "jit"])
+@pytest.mark.parametrize("other", [0.5, 0.9, 0.95])
+@pytest.mark.parametrize("discount", [0.999, 0.9999, 0.99999])
+def test_what_float32_calls_a_tie_does_not_add_up(transform, other, discount):
+    """A state with a better and a worse way to stay, and rare ways out: what is lost in a step is lost for ever."""
+    rare = np.float32(2**-20)
+    transition = np.zeros((3, 2, 3), np.float32)
+    transition[0] = [1 - 2 * rare, rare, rare]
+    transition[1, :, 1] = transition[2, :, 2] = 1.0
+    reward = np.array([[other, 1.0], [1.0, 1.0], [-1.0, -1.0]], np.float32)
+    mdp = MDP.from_dense(transition, discount=discount)
+    plan = transform(optimal_policy)(mdp, reward)
+    best, _ = oracles.optimal_value(transition.astype(float), float(mdp.discount), reward.astype(float))
+    worth = oracles.policy_value(transition.astype(float), float(mdp.discount), np.asarray(plan.policy), reward)
+    np.testing.assert_allclose(worth, best, rtol=1e-6)
+
+
+@pytest.mark.parametrize("discount", [0.9, 0.9999, 0.999999])
+@pytest.mark.parametrize("excess", [0.0, 9e-7])
+def test_float32_says_what_rounding_may_have_made_of_a_value(discount, excess):
+    """Reward 1 everywhere; rows that sum to 1 but for a few roundings, which a program takes as they are."""
+    transition = (np.full((3, 1, 3), 1 / 3) * (1 + excess)).astype(np.float32)
+    mdp = MDP.from_dense(transition, discount=discount)
+    reward = np.ones((3, 1), np.float32)
+    exact = 1 / (1 - float(mdp.discount))
+    plan = jax.jit(optimal_policy)(mdp, reward)
+    error = np.abs(np.asarray(plan.value, float) - exact).max()
+    assert error <= 1.001 * float(plan.residual) * exact
+    assert plan.status != Status.SOLVED or error <= 0.02 * exact
+    np.testing.assert_allclose(optimal_policy(mdp, reward).value, exact, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_iterations": 1.5}, "max_iterations must be a whole number, got 1.5"),
+        ({"max_iterations": -1}, "max_iterations must be at least 0, got -1"),
+        ({"tolerance": -1.0}, "tolerance must not be negative, got -1.0"),
+        ({"tolerance": np.nan}, "tolerance must be finite, got nan"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options, message):
+    mdp = MDP.from_dense(np.ones((1, 1, 1)), discount=0.9)
+    with pytest.raises(ValueError, match=message):
+        optimal_policy(mdp, np.zeros((1, 1)), **options)

@@ -124,6 +124,8 @@ def count(text: str) -> int:
         raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
     if number < 0:
         raise argparse.ArgumentTypeError(f"must not be negative, got {text}")
+    if number >= 2**63:
+        raise argparse.ArgumentTypeError(f"must be below 2^63, got {text}")
     return number
 
 

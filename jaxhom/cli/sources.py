@@ -21,6 +21,7 @@ from jaxhom.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.domains import Racetrack, TileMap, racetrack
 from jaxhom.domains.track_maps import SHIPPED
 from jaxhom.impossible_steps import ImpossibleStepsWarning
+from jaxhom.inputs import check_policy
 from jaxhom.interop.environment_maps import tile_map
 from jaxhom.interop.environments import from_gymnasium, make_environment, require_steps_of_table
 from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, load_mdp, load_policy
@@ -259,4 +260,7 @@ def load_policy_of(problem: Problem, path: str) -> np.ndarray:
     shape = (problem.mdp.num_states, problem.mdp.num_actions)
     if policy.shape != shape:
         raise FileError(f"{path}: its policy is {policy.shape}, but {problem.name} has {shape} states and actions")
-    return policy
+    try:
+        return np.asarray(check_policy(problem.mdp, policy, batch=False))
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from None

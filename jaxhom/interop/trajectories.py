@@ -13,7 +13,7 @@ import csv
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +26,9 @@ from jaxhom.mdp import MDP
 COLUMNS = ("episode", "state", "action")
 STEP_COLUMNS = ("step", "t", "time", "timestep")
 _FIELDS = (("obs", "acts"), ("observations", "actions"))
-_TERMINATED = ("terminal", "terminated", "terminations", "terminals", "dones")  # under which names an end is recorded
-_CUT = ("truncated", "truncations", "timeouts")
+# Under which names an end is recorded, and that it was a cut.
+_TERMINATED = ("terminal", "terminated", "terminations", "terminals", "dones", "done")
+_CUT = ("truncated", "truncations", "truncation", "timeouts", "timeout")
 _NEXT = ("next_obs", "next_observations")
 _LARGEST_INDEX = 2**31 - 1
 
@@ -64,7 +65,8 @@ def demonstrations_from_episodes(
       episodes: M of them, or a data set with `iterate_episodes()` (Minari's). An episode is an object or a mapping with
         `obs` and `acts` (imitation's trajectories) or `observations` and `actions` (Minari's), or a pair
         (observations, actions). H actions go with H + 1 observations, or with H if the last is missing. One that has
-        `terminal` or `terminations` says by it whether it terminated; others count as cut off.
+        `terminal` or `terminations` says by it whether it terminated, unless `truncations`, `timeouts` or its `infos`
+        say that it was cut off; others count as cut off.
       to_states: takes the observations of one episode as they are stored and returns as many state indices; for
         one-hot vectors `lambda observations: observations.argmax(axis=-1)`.
 
@@ -94,7 +96,7 @@ def demonstrations_from_episodes(
             continue
         final += len(states) - len(actions)
         kept.append((states, actions))
-        ended.append(_has_terminated(episode))
+        ended.append(_has_terminated(position, episode))
     require_no_steps(pairs, "episode")
     return _finish(kept, dropped, final, ended)
 
@@ -121,8 +123,7 @@ def _is_one(episodes) -> bool:
 def _require_one_episode(position: int, episode) -> None:
     """Raises if an episode has an end before its last step, or a step that does not begin where the former led to."""
     for name in (*_TERMINATED, *_CUT):
-        flags = np.atleast_1d(np.asarray(False if (found := _field(episode, name)) is None else found))
-        if flags[:-1].astype(bool).any():
+        if _flags_of(position, episode, name)[:-1].any():
             raise ValueError(_FLAT.format(f"episode {position} ends before its last step ({name})"))
     before, after = _field(episode, "obs", "observations"), _field(episode, *_NEXT)
     if after is not None and np.shape(before) == np.shape(after) and not np.all(_continues(before, after)):
@@ -135,13 +136,26 @@ def _continues(before, after) -> np.ndarray:
     return same.reshape(len(same), -1).all(axis=1)
 
 
-def _has_terminated(episode) -> bool:
-    """Whether an episode says that it ended in a terminal state, and was not cut off there (imitation's `infos`)."""
-    flags = np.atleast_1d(np.asarray(False if (found := _field(episode, *_TERMINATED)) is None else found))
+def _has_terminated(position: int, episode) -> bool:
+    """Whether an episode says that it ended in a terminal state, and nothing (imitation's `infos`) that it was cut."""
     infos = _field(episode, "infos")
-    last = infos[-1] if infos is not None and len(infos) else None
+    last = infos[-1] if isinstance(infos, Sequence | np.ndarray) and np.size(infos) else None
     was_cut = isinstance(last, Mapping) and last.get("TimeLimit.truncated", False)
-    return bool(flags.size and flags[-1]) and not was_cut
+    ended, cut = (
+        next((flags[-1] for name in names if (flags := _flags_of(position, episode, name)).size), False)
+        for names in (_TERMINATED, _CUT)
+    )
+    return bool(ended and not cut and not was_cut)
+
+
+def _flags_of(position: int, episode, name: str) -> np.ndarray:
+    """The flags of an episode under one name, bool [any number]; empty where it has none."""
+    found = _field(episode, name)
+    if found is None:
+        return np.zeros(0, bool)
+    name = f"episode {position}: {name}"
+    flags = np.ravel(checks.as_host_array(name, found))
+    return _flags(name, flags, len(flags))
 
 
 def demonstrations_from_steps(

@@ -92,7 +92,7 @@ def lpal(
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
     """
-    if method not in _METHODS:
+    if not isinstance(method, str) or method not in _METHODS:
         raise ValueError(f"method must be one of {tuple(_METHODS)}, got {method!r}")
     mdp = as_model(mdp)
     if not mdp.num_features:
@@ -126,8 +126,8 @@ def _solve(mdp: MDP, expectations: np.ndarray, initial_policy, tolerance, method
     reduction = reduce_expectations(mdp, expectations)
     if tolerance is None:
         tolerance = default_tolerance(mdp, reduction)
-    elif not tolerance > 0:
-        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    else:
+        checks.require_positive("tolerance", tolerance)
     tolerance = np.broadcast_to(np.asarray(tolerance, np.float64), len(expectations))
     features = np.asarray(mdp.features)
     unit = float(np.exp2(np.floor(np.log2(np.abs(features).max() or 1.0))))  # a power of two changes no digit

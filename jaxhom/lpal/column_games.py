@@ -7,6 +7,7 @@ import numpy as np
 from jaxhom.game_interior_point import GameSolution, solve_game
 from jaxhom.pdhg import engine
 from jaxhom.pdhg.matrix_game import MatrixGame
+from jaxhom.programs import host_jit
 
 _FIRST_CAPACITY = 32
 _MAX_NEWTON_SIZE = 256  # strategies of the player who has fewer; the normal matrix of a step is that large
@@ -53,7 +54,7 @@ def play(payoffs: list[np.ndarray], former, bounds, tolerance, share: float, wid
     return jax.tree.map(np.asarray, solve(stacked, is_column, bound, start, goal, share))
 
 
-@jax.jit
+@host_jit
 def _by_interior_point(payoff, is_column, bound, start, tolerance, share) -> GameSolution:
     def solve(payoff, is_column, bound, start, tolerance):
         return solve_game(payoff, is_column, tolerance=tolerance, share=share, bound=bound, start=start)
@@ -61,7 +62,7 @@ def _by_interior_point(payoff, is_column, bound, start, tolerance, share) -> Gam
     return jax.vmap(solve)(payoff, is_column, bound, start, tolerance)
 
 
-@jax.jit
+@host_jit
 def _by_pdhg(payoff, is_column, bound, start, tolerance, share) -> GameSolution:
     """For many strategies on both sides."""
     del bound, share

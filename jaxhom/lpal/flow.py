@@ -29,6 +29,7 @@ from jaxhom.mdp import MDP, uniform_policy
 from jaxhom.occupancy import occupancy
 from jaxhom.pdhg import engine
 from jaxhom.pdhg.flow_lp import FlowProblem
+from jaxhom.programs import host_jit
 from jaxhom.status import Status
 
 DEFAULT_ITERATIONS = 20_000
@@ -109,7 +110,7 @@ def _units(size: np.ndarray) -> np.ndarray:
     return largest * 16.0**-smaller
 
 
-@jax.jit
+@host_jit
 def _start(problem: FlowProblem, initial_policy: jax.Array) -> engine.PDHGState:
     primal, _ = problem.start()
     x = occupancy(problem.mdp, initial_policy) * (1.0 - problem.mdp.discount)
@@ -117,7 +118,7 @@ def _start(problem: FlowProblem, initial_policy: jax.Array) -> engine.PDHGState:
     return state.replace(weight=jnp.full_like(state.weight, _FIRST_WEIGHT))
 
 
-@jax.jit
+@host_jit
 def _advance(problem: FlowProblem, state: engine.PDHGState, steps=_STEPS_PER_LOOK) -> engine.PDHGState:
     def step(_, state):
         state = engine.step(problem, state)
@@ -128,7 +129,7 @@ def _advance(problem: FlowProblem, state: engine.PDHGState, steps=_STEPS_PER_LOO
     return jax.lax.fori_loop(0, steps, step, state)
 
 
-@jax.jit
+@host_jit
 def _look(problem, expectations, state, bound: UpperBound | None, value, tolerance, iterations):
     """The best bound so far, the value function of the newest weights, and the best policy that the state suggests."""
     mdp = problem.mdp
@@ -167,7 +168,7 @@ def _solution(mdp, expectations, x, bound: UpperBound, tolerance, iterations) ->
     )
 
 
-@jax.jit
+@host_jit
 def _better(one: LPALSolution, other: LPALSolution, tolerance) -> LPALSolution:
     """Lane by lane the larger margin, with the newest bound; lanes that were solved stay as they are."""
     take = (other.margin > one.margin) & (one.status != Status.SOLVED)

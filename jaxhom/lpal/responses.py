@@ -11,6 +11,7 @@ from jaxhom.chain_solver import rough_state_occupancy
 from jaxhom.lpal.certificate import bound_by_planning, simplex_point
 from jaxhom.lpal.exact import Exact, compact_features, exact_rows
 from jaxhom.mdp import MDP
+from jaxhom.programs import host_jit
 
 
 def with_compact_features(mdp: MDP) -> MDP:
@@ -19,7 +20,7 @@ def with_compact_features(mdp: MDP) -> MDP:
     return mdp if features.shape[1] > 1 else dataclasses.replace(mdp, features=checks.to_device(features))
 
 
-@jax.jit
+@host_jit
 def respond(mdp: MDP, expectations, weights, value, accuracy, error) -> dict[str, jax.Array]:
     """The best responses to weights, and the bounds that they prove.
 
@@ -46,7 +47,7 @@ def respond(mdp: MDP, expectations, weights, value, accuracy, error) -> dict[str
     }
 
 
-@jax.jit
+@host_jit
 def evaluate(mdp: MDP, policy) -> tuple[jax.Array, jax.Array]:
     """State occupancy [S] and feature expectations [K] of a policy [S, A]."""
     mu, expected = _expected_features(mdp, policy[None], 0.0)

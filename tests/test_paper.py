@@ -7,7 +7,7 @@ import pytest
 
 import jaxhom
 
-SETS = 20
+SETS = 10
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxhom.homomorphism_newton import factorise
 from jaxhom.lane_queue import Solver
 from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem
+from jaxhom.programs import host_jit
 
 MAX_ITERATIONS = 60
 _TO_BOUNDARY = 0.99
@@ -124,7 +125,7 @@ def is_finished(state: InteriorPointState, tolerance, threshold, max_iterations)
     return finished
 
 
-SOLVER = Solver(init, step, is_finished)
+SOLVER = Solver(init, step, is_finished, host_jit)
 
 
 def solve(problem: HomomorphismProblem, *, tolerance, max_iterations: int = MAX_ITERATIONS) -> InteriorPointState:

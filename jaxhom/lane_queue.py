@@ -33,11 +33,13 @@ class Solver(NamedTuple):
       init: problem -> state.
       step: problem, state -> state.
       is_finished: state, tolerance, threshold, max_iterations -> bool [lanes].
+      jit: how the steps are compiled; `jax.jit`, or `host_jit` where that runs as fast.
     """
 
     init: Callable[[Any], Any]
     step: Callable[[Any, Any], Any]
     is_finished: Callable[..., jax.Array]
+    jit: Callable = jax.jit
 
 
 def solve_many(
@@ -154,7 +156,7 @@ def _drain(queue: _Queue, solver: Solver, lanes: int, devices, tolerance, max_it
         batch = _shard(jax.tree.map(lambda leaf, owner=owner: leaf[..., owner], queue.problem), devices)
         fresh_state = _init(solver, batch)
         state = fresh_state if state is None else _merge(state, fresh_state, source)
-        state, done = _run(solver, batch, state, queue.limits[owner], used, tolerance, max_iterations)
+        state, done = _program(solver)(batch, state, queue.limits[owner], used, tolerance, max_iterations)
         done = np.asarray(done)[:used]
         busy, finished = np.flatnonzero(~done), np.flatnonzero(done)
         queue.store(state, finished, owner[finished])
@@ -183,7 +185,12 @@ def _merge(state, fresh, source):
     return jax.tree.map(lambda old, new: jnp.where(source >= 0, old[..., source], new), state, fresh)
 
 
-@functools.partial(host_jit, static_argnums=0)
+@functools.cache
+def _program(solver: Solver) -> Callable:
+    """`_run` of a solver, compiled."""
+    return solver.jit(functools.partial(_run, solver))
+
+
 def _run(solver: Solver, problem, state, threshold, used, tolerance, max_iterations):
     """Steps until a quarter of the `used` lanes are done; returns which."""
 

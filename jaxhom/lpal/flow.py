@@ -29,7 +29,6 @@ from jaxhom.mdp import MDP, uniform_policy
 from jaxhom.occupancy import occupancy
 from jaxhom.pdhg import engine
 from jaxhom.pdhg.flow_lp import FlowProblem
-from jaxhom.programs import host_jit
 from jaxhom.status import Status
 
 DEFAULT_ITERATIONS = 20_000
@@ -110,7 +109,7 @@ def _units(size: np.ndarray) -> np.ndarray:
     return largest * 16.0**-smaller
 
 
-@host_jit
+@jax.jit
 def _start(problem: FlowProblem, initial_policy: jax.Array) -> engine.PDHGState:
     primal, _ = problem.start()
     x = occupancy(problem.mdp, initial_policy) * (1.0 - problem.mdp.discount)
@@ -118,7 +117,7 @@ def _start(problem: FlowProblem, initial_policy: jax.Array) -> engine.PDHGState:
     return state.replace(weight=jnp.full_like(state.weight, _FIRST_WEIGHT))
 
 
-@host_jit
+@jax.jit
 def _advance(problem: FlowProblem, state: engine.PDHGState, steps=_STEPS_PER_LOOK) -> engine.PDHGState:
     def step(_, state):
         state = engine.step(problem, state)
@@ -129,7 +128,7 @@ def _advance(problem: FlowProblem, state: engine.PDHGState, steps=_STEPS_PER_LOO
     return jax.lax.fori_loop(0, steps, step, state)
 
 
-@host_jit
+@jax.jit
 def _look(problem, expectations, state, bound: UpperBound | None, value, tolerance, iterations):
     """The best bound so far, the value function of the newest weights, and the best policy that the state suggests."""
     mdp = problem.mdp
@@ -168,7 +167,7 @@ def _solution(mdp, expectations, x, bound: UpperBound, tolerance, iterations) ->
     )
 
 
-@host_jit
+@jax.jit
 def _better(one: LPALSolution, other: LPALSolution, tolerance) -> LPALSolution:
     """Lane by lane the larger margin, with the newest bound; lanes that were solved stay as they are."""
     take = (other.margin > one.margin) & (one.status != Status.SOLVED)

@@ -11,7 +11,6 @@ from jaxhom.chain_solver import rough_state_occupancy
 from jaxhom.lpal.certificate import bound_by_planning, simplex_point
 from jaxhom.lpal.exact import Exact, compact_features, exact_rows
 from jaxhom.mdp import MDP
-from jaxhom.programs import host_jit
 
 
 def with_compact_features(mdp: MDP) -> MDP:
@@ -20,7 +19,7 @@ def with_compact_features(mdp: MDP) -> MDP:
     return mdp if features.shape[1] > 1 else dataclasses.replace(mdp, features=checks.to_device(features))
 
 
-@host_jit
+@jax.jit
 def respond(mdp: MDP, expectations, weights, value, accuracy, error) -> dict[str, jax.Array]:
     """The best responses to weights, and the bounds that they prove.
 
@@ -47,7 +46,7 @@ def respond(mdp: MDP, expectations, weights, value, accuracy, error) -> dict[str
     }
 
 
-@host_jit
+@jax.jit
 def evaluate(mdp: MDP, policy) -> tuple[jax.Array, jax.Array]:
     """State occupancy [S] and feature expectations [K] of a policy [S, A]."""
     mu, expected = _expected_features(mdp, policy[None], 0.0)

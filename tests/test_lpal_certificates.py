@@ -435,3 +435,20 @@ def test_projection_on_a_weighted_simplex(rng):
         size = np.abs(point[:, lane]).max() / share.min()
         np.testing.assert_allclose(threshold, threshold[0], rtol=1e-6, atol=1e-9 * size)
         assert np.all(t[q[:, lane] == 0, lane] <= threshold[0] + 1e-9 * size)
+
+
+@pytest.mark.parametrize("discount", [0.9, 0.999])
+def test_float32_bounds_hold_for_an_initial_distribution_that_misses_one(discount):
+    """A seventh seven times is 1 + 4.5e-8: one feature, whose best expectation planning gives to the last digit."""
+    rng = np.random.default_rng(3)
+    transition = np.eye(7)[rng.integers(7, size=(7, 2))]
+    features, initial = rng.random((7, 2, 1)).astype(np.float32), np.full(7, 1 / 7, np.float32)
+    assert initial.sum(dtype=float) > 1
+    mdp = MDP.from_dense(transition.astype(np.float32), discount=discount, initial=initial, features=features)
+    value, _ = oracles.optimal_value(transition, float(mdp.discount), features[..., 0].astype(float))
+    stored = np.asarray(mdp.initial, float)
+    bests = [start @ value for start in (stored, stored / stored.sum())]
+    expected = np.float32(bests[0])
+    solution = lpal(mdp, np.array([expected]))
+    assert solution.margin <= min(bests) - float(expected)
+    assert max(bests) - float(expected) <= solution.margin_bound

@@ -88,6 +88,8 @@ class Certifier:
     def __init__(self, mdp: MDP, expectations: np.ndarray, tolerance: np.ndarray, reduction: Reduction, unit: float):
         self.exact = Exact(mdp)
         self._variants = [exact for exact in (self.exact, self.exact.as_stored()) if exact]
+        # The initial distribution likewise, as it is stored and as it should be: all expectations are linear in it.
+        self._masses = np.array([1.0, 1.0 / self.exact.initial.sum()])
         self._mdp, self._expectations, self._tolerance = mdp, expectations, tolerance
         self._reduction, self._unit = reduction, unit
         is_rough = mdp.dtype != jnp.float64 or float(mdp.discount) > NEAR_ONE
@@ -135,7 +137,7 @@ class Certifier:
             found, expected, error = exact.expectations(policy.astype(np.float64), guess, self._tolerance[lane])
             error = error + 2.0 * _EPS * (np.abs(expected) + np.abs(asked))
             mu, guess = found if mu is None else mu, found
-            margin = min(margin, float((expected - asked - error).min()))
+            margin = min(margin, float((self._masses[:, None] * expected - asked - error).min()))
         return mu, margin
 
     def _bound(self, lane: int, weights: np.ndarray, found: Found) -> tuple[float, np.ndarray]:
@@ -146,7 +148,7 @@ class Certifier:
         best, actions = -np.inf, found.actions
         for exact in self._variants:
             bound, value, actions = exact.plan(weights, value, actions, self._tolerance[lane])
-            best = max(best, bound)
+            best = max(best, *(self._masses * bound))
         target = weights * self._expectations[lane]
         rounding = (len(weights) + 4) * _EPS * (np.abs(target).sum() + abs(best))
         return float(best - target.sum() + rounding), actions

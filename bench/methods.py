@@ -16,8 +16,8 @@ import jaxhom
 from bench.problems import Problem, build_domain
 from bench.settings import Setting
 from jaxhom import MDP, Status
-from jaxhom.homomorphism import ClassSimilarity
-from jaxhom.local_models import LocalModelClasses, local_model_classes
+from jaxhom.similarity.homomorphism import ClassSimilarity
+from jaxhom.similarity.local_models import LocalModelClasses, local_model_classes
 
 _SIMILARITY_TOLERANCE = 1e-4
 _MONTE_CARLO_SHARE = 1e-3  # LPAL's gap as a share of what each of K regions gets of evenly spread time

@@ -2,7 +2,7 @@
 
 Each gets LP (9) in its standard form, x = (f, e): minimise e subject to E f = 1, K f <= e, -K f <= e, f >= 0, the row
 of the centre fixed by bounds. The multipliers of the two blocks of inequalities give y = y+ - y-, the dual point of
-`jaxhom.pdhg.homomorphism_lp`, so that one certificate judges every solver. Solvers that run on one core share the
+`jaxhom.similarity.homomorphism_lp`, so that one certificate judges every solver. Solvers that run on one core share the
 pairs between two spawned processes; `seconds` is what the slower of them spent on building and solving, without the
 transfer.
 """

@@ -20,12 +20,12 @@ import numpy as np  # noqa: E402
 import jaxhom  # noqa: E402
 from bench import peers  # noqa: E402
 from bench.speed_rows import commit, print_row, versions  # noqa: E402
-from jaxhom.brackets import bracket_errors  # noqa: E402
-from jaxhom.homomorphism import ClassSimilarity  # noqa: E402
-from jaxhom.local_models import local_model_classes, restricted_model  # noqa: E402
-from jaxhom.pdhg import engine  # noqa: E402
-from jaxhom.pdhg.global_homomorphism_lp import GlobalHomomorphismProblem  # noqa: E402
-from jaxhom.pdhg.homomorphism_lp import HomomorphismProblem  # noqa: E402
+from jaxhom.generalization.global_lp import GlobalHomomorphismProblem  # noqa: E402
+from jaxhom.similarity.brackets import bracket_errors  # noqa: E402
+from jaxhom.similarity.homomorphism import ClassSimilarity  # noqa: E402
+from jaxhom.similarity.homomorphism_lp import HomomorphismProblem  # noqa: E402
+from jaxhom.similarity.local_models import local_model_classes, restricted_model  # noqa: E402
+from jaxhom.solvers import pdhg  # noqa: E402
 
 NUM_ACTIONS = 4
 GAP = 1e-4
@@ -382,12 +382,12 @@ def section_peak(quick: bool) -> list[dict]:
 
 
 def _iteration(n: int, dtype, peak: float, lanes: int = 64) -> dict:
-    """One iteration of a batch of PDHG lanes, from a call of `engine.step`."""
+    """One iteration of a batch of PDHG lanes, from a call of `pdhg.step`."""
     problem = pair_problem(*random_pairs(n, lanes, dtype))
-    state = engine.init(problem)
-    step = jax.jit(engine.step)
+    state = pdhg.init(problem)
+    step = jax.jit(pdhg.step)
     _, compile_s, seconds = timed(lambda: [step(problem, state).lower.block_until_ready() for _ in range(20)])
-    seconds /= 20 * engine.STEPS_PER_CHECK
+    seconds /= 20 * pdhg.STEPS_PER_CHECK
     flops = 4.0 * n * NUM_ACTIONS * n * (n + n) * lanes
     # Both models for K and for K^T; the iterate read, its anchor read, the next written.
     numbers = lanes * (2 * NUM_ACTIONS * 2 * n * n + 3 * (n * n + n * NUM_ACTIONS * n))

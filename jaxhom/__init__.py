@@ -11,35 +11,36 @@ from jaxhom import interrupts
 
 interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
 
-from jaxhom.brackets import LocalSimilarity
-from jaxhom.demonstrations import (
-    Demonstrations,
-    empirical_policy,
-    monte_carlo_feature_expectations,
-    sample_demonstrations,
-)
-from jaxhom.domains import Gridworld, Racetrack, gridworld, racetrack, sample_weights
-from jaxhom.evaluation import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
-from jaxhom.explanation import Explanation
-from jaxhom.generalization import (
+from jaxhom.apprenticeship.lpal import LPALSolution, lpal
+from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
+from jaxhom.domains.racetrack import Racetrack, racetrack
+from jaxhom.generalization.explanation import Explanation
+from jaxhom.generalization.generalization import (
     Generalization,
     maximum_entropy,
     nearest_neighbors,
     soft_local_homomorphism,
 )
-from jaxhom.global_homomorphism import soft_homomorphism
-from jaxhom.homomorphism import (
+from jaxhom.generalization.regression import occupancy_regression
+from jaxhom.generalization.soft_homomorphism import soft_homomorphism
+from jaxhom.models.demonstrations import (
+    Demonstrations,
+    empirical_policy,
+    monte_carlo_feature_expectations,
+    sample_demonstrations,
+)
+from jaxhom.models.impossible_steps import ImpossibleStepsWarning
+from jaxhom.models.mdp import MDP
+from jaxhom.planning.occupancy import feature_expectations, occupancy, policy_value
+from jaxhom.planning.optimal import Plan, optimal_policy
+from jaxhom.planning.trials import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
+from jaxhom.similarity.brackets import LocalSimilarity
+from jaxhom.similarity.homomorphism import (
     homomorphism_error,
     local_similarity,
     locally_similar,
 )
-from jaxhom.homomorphism_map import homomorphism_map
-from jaxhom.impossible_steps import ImpossibleStepsWarning
-from jaxhom.lpal import LPALSolution, lpal
-from jaxhom.mdp import MDP
-from jaxhom.occupancy import feature_expectations, occupancy, policy_value
-from jaxhom.occupancy_regression import occupancy_regression
-from jaxhom.planning import Plan, optimal_policy
+from jaxhom.similarity.homomorphism_map import homomorphism_map
 from jaxhom.status import Status
 
 __version__ = "0.1.0"

@@ -7,7 +7,7 @@ from jaxhom import interrupts
 
 def _run() -> int:
     try:
-        from jaxhom.cli import main
+        from jaxhom.cli.parser import main
 
         interrupts.watch()
         return main()

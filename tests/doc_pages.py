@@ -113,7 +113,7 @@ def _split(text: str) -> tuple[list[str], list[str]]:
 
 def _run_command(line: str) -> None:
     from bench import reproduce
-    from jaxhom.cli import main
+    from jaxhom.cli.parser import main
 
     words = shlex.split(line)
     if words[:3] == ["python", "-m", "jaxhom"]:

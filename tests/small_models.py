@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 
 class Case(NamedTuple):

@@ -1,6 +1,10 @@
-"""The arrows between the modules point one way, and importing the library has no side effects."""
+"""The house: which room imports from which, how long the way through it is, and that importing has no side effects.
+
+`python tests/test_architecture.py` prints the rooms, the longest chain of imports between them, and the largest files.
+"""
 
 import ast
+import functools
 import graphlib
 import json
 import pathlib
@@ -12,62 +16,29 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "jaxhom"
 
-# The table of the design: a module imports only from rows with a smaller number than its own.
-# Inside a package (pdhg, lpal, domains, interop, plotting, cli) the modules may import one another, one way.
-ROWS = {
-    "interrupts": -1,  # signals and pipes
-    "status": -1,  # how an answer ended
-    "checks": -1,  # host-side checks know nothing of models: above everything, mdp.py included
-    "outward": -1,
-    "programs": -1,
-    "canonical_forms": -1,  # arrays in, keys out
-    "first_order": -1,  # a value in, the same value out
-    "padded_rows": -1,  # arrays in, arrays out
-    "policy_chain": -0.5,
-    "mdp": 0,
-    "inputs": 0.5,
-    "chain_solver": 0.5,
-    "host_chains": 0.5,
-    "occupancy": 1,
-    "policy_iteration": 1.05,
-    "planning_sensitivity": 1.1,
-    "planning": 1.2,
-    "impossible_steps": 0.6,
-    "episode_ends": 0.6,
-    "demonstrations": 1,
-    "host_graph": 0.6,
-    "local_models": 1,
-    "lane_queue": 0.5,
-    "inverse_factor": 0.5,
-    "block_tridiagonal": 0.5,
-    "game_interior_point": 0.6,
-    "pdhg": 1,
-    "homomorphism_newton": 1.2,
-    "interior_point": 1.3,
-    "normal_equations": 1.2,
-    "sparse_interior_point": 1.3,
-    "host_certificates": 1.4,
-    "brackets": 1.6,
-    "homomorphism": 2,
-    "homomorphism_map": 2,
-    "certified_maps": 2,
-    "lpal": 2,
-    "evidence": 2,
-    "votes": 2,
-    "explanation": 2.3,
-    "explainers": 2.6,
-    "generalization": 3,
-    "global_homomorphism": 3.5,
-    "occupancy_regression": 3.5,
-    "evaluation": 4,
-    "domains": 4,
-    "jaxhom": 4.5,  # the public names, jaxhom/__init__.py
-    "interop": 5,
-    "plotting": 5,
-    "cli": 6,  # the command line, started by __main__.py
-    "__main__": 7,
+# Every room, and all the rooms that it may import from. `jaxhom` is the face, jaxhom/__init__.py.
+TOOLS = {"checks", "status"}
+GIVEN = TOOLS | {"models", "solvers"}
+CORE = GIVEN | {"planning", "similarity", "generalization", "apprenticeship", "domains"}
+MAY_IMPORT = {
+    "checks": set(),
+    "status": set(),
+    "interrupts": set(),
+    "models": TOOLS,
+    "solvers": TOOLS,
+    "planning": GIVEN,
+    "similarity": GIVEN,
+    "generalization": GIVEN | {"planning", "similarity"},
+    "apprenticeship": GIVEN | {"planning"},
+    "domains": TOOLS | {"models", "planning"},
+    "jaxhom": CORE | {"interrupts"},
+    "interop": CORE,
+    "plotting": CORE,
+    "cli": CORE | {"interrupts", "interop", "plotting"},
+    "__main__": {"interrupts", "cli"},
 }
-LAST_CORE_ROW = 4
+MOST_ROOMS, LONGEST_CHAIN = 16, 8
+NO_FACE = ["models", "solvers", "planning", "similarity", "generalization", "apprenticeship", "domains", "cli"]
 
 
 def module_name(path):
@@ -78,8 +49,8 @@ def module_name(path):
 FILES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
-def row_name(module):
-    """The entry of the table that a module belongs to."""
+def room(module):
+    """The room that a module belongs to."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else parts[0]
 
@@ -106,27 +77,50 @@ def arrows(module):
     return {name for name in imported_names(module) if name.split(".")[0] == "jaxhom"}
 
 
+def rooms():
+    """From each room to those that it imports from."""
+    graph = {}
+    for module in FILES:
+        graph.setdefault(room(module), set()).update(room(other) for other in arrows(module))
+    return {name: others - {name} for name, others in graph.items()}
+
+
+def longest_chain(graph):
+    """The rooms of the longest chain of imports."""
+
+    @functools.cache
+    def below(name):
+        return [name, *max((below(other) for other in graph[name]), key=len, default=[])]
+
+    return max(map(below, graph), key=len)
+
+
 def test_imports_are_found():
-    assert "jaxhom.mdp" in arrows("jaxhom.occupancy")
-    assert "jaxhom.checks" in arrows("jaxhom.mdp")  # `from jaxhom import checks`
-    assert "numpy" in set(imported_names("jaxhom.mdp"))
+    assert "jaxhom.models.mdp" in arrows("jaxhom.planning.occupancy")
+    assert "jaxhom.checks" in arrows("jaxhom.models.mdp")  # `from jaxhom import checks`
+    assert "numpy" in set(imported_names("jaxhom.models.mdp"))
 
 
-@pytest.mark.parametrize("module", FILES)
-def test_imports_point_to_rows_above(module):
-    assert row_name(module) in ROWS, f"give {module} a row in the design and in this test"
-    row = ROWS[row_name(module)]
-    for other in arrows(module):
-        if row_name(other) != row_name(module):
-            other_row = ROWS[row_name(other)]
-            assert other_row < row, f"{module} (row {row}) imports {other} (row {other_row})"
+def test_rooms_import_from_the_rooms_that_they_may():
+    for name, others in rooms().items():
+        assert others <= MAY_IMPORT[name], f"{name} imports from {sorted(others - MAY_IMPORT[name])}"
 
 
-@pytest.mark.parametrize("package", ["pdhg", "lpal", "domains", "interop", "plotting", "cli"])
-def test_imports_inside_a_package_point_one_way(package):
-    inside = [module for module in FILES if row_name(module) == package]
-    graph = {module: [m for m in arrows(module) if m in inside] for module in inside}
-    list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
+def test_the_house_is_small_and_has_no_circle():
+    assert len(MAY_IMPORT) - 1 <= MOST_ROOMS  # the face is no room
+    list(graphlib.TopologicalSorter(rooms()).static_order())  # raises CycleError
+    assert len(longest_chain(rooms())) <= LONGEST_CHAIN
+
+
+@pytest.mark.parametrize("name", sorted(n for n in MAY_IMPORT if (PACKAGE / n).is_dir()))
+def test_imports_inside_a_room_point_one_way(name):
+    graph = {module: {m for m in arrows(module) if room(m) == name} for module in FILES if room(module) == name}
+    list(graphlib.TopologicalSorter(graph).static_order())
+
+
+@pytest.mark.parametrize("name", NO_FACE)
+def test_only_the_library_itself_and_its_doors_export(name):
+    assert not list(imported_names(f"jaxhom.{name}"))  # so no function stands where its module does
 
 
 @pytest.mark.parametrize("library", ["jaxopt"])
@@ -157,7 +151,7 @@ print(json.dumps([changed, jax.config.jax_enable_x64, sorted(sys.modules)]))
 @pytest.mark.parametrize("x64", ["0", "1"])
 def test_importing_changes_no_setting_and_brings_in_no_optional_library(x64):
     """`import jaxhom`, its modules up to the domains, and the doors to other libraries, in a fresh interpreter."""
-    core = [m for m in FILES if ROWS.get(row_name(m), 9) <= LAST_CORE_ROW or row_name(m) == "interop"]
+    core = [m for m in FILES if room(m) in CORE | {"interop"}]
     result = subprocess.run(
         [sys.executable, "-c", PROBE.format(modules=core)],
         cwd=ROOT,
@@ -172,3 +166,11 @@ def test_importing_changes_no_setting_and_brings_in_no_optional_library(x64):
     assert x64_after == (x64 == "1")
     unwanted = {"matplotlib", "gymnasium", "minari", "imitation", "torch", "tensorflow", "pandas"}
     assert not unwanted & {name.split(".")[0] for name in loaded}
+
+
+if __name__ == "__main__":
+    for name, others in rooms().items():
+        print(f"{name:16}{', '.join(sorted(others))}")
+    sizes = {module: len(path.read_text().splitlines()) for module, path in FILES.items()}
+    print(len(rooms()) - 1, "rooms in jaxhom/, longest chain of imports:", " > ".join(longest_chain(rooms())))
+    print("largest files:", ", ".join(f"{m} {sizes[m]}" for m in sorted(sizes, key=sizes.get, reverse=True)[:5]))

@@ -14,7 +14,8 @@ import pytest
 from cli_cases import Files
 
 from jaxhom import interrupts
-from jaxhom.cli import main, parser
+from jaxhom.cli import parser
+from jaxhom.cli.parser import main
 
 LEARN = ["learn", "--env", "FrozenLake-v1", "--expert", "2", "--method", "maximum-entropy"]
 

@@ -5,7 +5,8 @@ import oracles
 import pytest
 
 from jaxhom import MDP, Demonstrations, local_similarity, locally_similar, soft_local_homomorphism
-from jaxhom.local_models import local_model_classes, local_models, reachable_within
+from jaxhom.models.graph import reachable_within
+from jaxhom.similarity.local_models import local_model_classes, local_models
 
 
 def random_model(rng, num_states=5, num_actions=3):
@@ -77,7 +78,7 @@ def test_many_paths_of_two_steps_are_one_connection():
 
 def test_a_hub_is_left_open_and_costs_nothing(monkeypatch):
     """A state with very many successors is no reason to make everything as large as its local model."""
-    from jaxhom import homomorphism, local_models
+    from jaxhom.similarity import homomorphism, local_models
 
     monkeypatch.setattr(local_models, "_MAX_ENTRIES", 5000)
     num_states = 90

@@ -8,7 +8,7 @@ PROGRAM = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from jaxhom.brackets import bracket_errors
+from jaxhom.similarity.brackets import bracket_errors
 
 assert jax.device_count() == {devices}
 rng = np.random.default_rng(0)

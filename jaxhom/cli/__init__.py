@@ -1,5 +1,1 @@
 """The command line: `python -m jaxhom` runs the main job, `python -m jaxhom learn` a user's own problem."""
-
-from jaxhom.cli.parser import main
-
-__all__ = ["main"]

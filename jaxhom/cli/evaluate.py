@@ -7,7 +7,7 @@ from jaxhom.cli.options import MODEL_HELP, add_command, add_model_options, count
 from jaxhom.cli.results import write_json
 from jaxhom.cli.sources import load_policy_of, load_problem
 from jaxhom.cli.tables import format_table
-from jaxhom.occupancy import feature_expectations
+from jaxhom.planning.occupancy import feature_expectations
 
 _EXAMPLES = """\
 examples:

@@ -9,16 +9,16 @@ import dataclasses
 import jax.numpy as jnp
 
 from jaxhom import interrupts
+from jaxhom.apprenticeship.lpal import lpal
 from jaxhom.cli import pictures, results
 from jaxhom.cli.methods import METHODS, check_method, generalize, wants_progress
 from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_method_options, add_model_options
 from jaxhom.cli.report import Report
 from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem, load_problem, load_trajectories
-from jaxhom.demonstrations import empirical_policy, monte_carlo_feature_expectations
 from jaxhom.interop import files
-from jaxhom.lpal import lpal
-from jaxhom.occupancy import feature_expectations
+from jaxhom.models.demonstrations import empirical_policy, monte_carlo_feature_expectations
+from jaxhom.planning.occupancy import feature_expectations
 
 _EXAMPLES = """\
 examples:

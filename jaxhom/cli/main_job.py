@@ -18,20 +18,21 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom import outward
+from jaxhom.apprenticeship.lpal import lpal
 from jaxhom.cli.methods import wants_progress
 from jaxhom.cli.options import Parser, count, positive
 from jaxhom.cli.pictures import load_plotting
 from jaxhom.cli.results import save_figure
 from jaxhom.cli.tables import GrowingTable
-from jaxhom.demonstrations import Demonstrations, sample_demonstrations
-from jaxhom.domains import Gridworld, Racetrack, gridworld, racetrack, sample_weights
-from jaxhom.evaluation import evaluate_exactly
-from jaxhom.generalization import maximum_entropy, nearest_neighbors, soft_local_homomorphism
-from jaxhom.lpal import lpal
-from jaxhom.mdp import MDP
-from jaxhom.occupancy import feature_expectations, policy_value
-from jaxhom.planning import Plan, optimal_policy
+from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
+from jaxhom.domains.racetrack import Racetrack, racetrack
+from jaxhom.generalization.generalization import maximum_entropy, nearest_neighbors, soft_local_homomorphism
+from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
+from jaxhom.models.mdp import MDP
+from jaxhom.planning.occupancy import feature_expectations, policy_value
+from jaxhom.planning.optimal import Plan, optimal_policy
+from jaxhom.planning.trials import evaluate_exactly
+from jaxhom.status import at_most
 
 GENERALIZATIONS: dict[str, Callable] = {
     "soft local homomorphism": soft_local_homomorphism,
@@ -61,7 +62,7 @@ class Row:
         """The row of the printed table."""
 
         def show(value, pattern=None):
-            return "" if np.isnan(value) else format(value, pattern) if pattern else outward.at_most(value)
+            return "" if np.isnan(value) else format(value, pattern) if pattern else at_most(value)
 
         return (
             self.method,

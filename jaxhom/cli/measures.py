@@ -17,15 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom import outward
 from jaxhom.cli.sources import Problem
 from jaxhom.cli.tables import format_table
-from jaxhom.evaluation import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
-from jaxhom.occupancy import occupancy, policy_value
+from jaxhom.planning.occupancy import occupancy, policy_value
+from jaxhom.planning.trials import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
+from jaxhom.status import at_most
 
 _FORMATS = {
     "value": "{:.5g}".format,
-    "loss <=": outward.at_most,
+    "loss <=": at_most,
     "reward": "{:.5g}".format,
     "steps": "{:.1f}".format,
 }

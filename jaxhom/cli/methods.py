@@ -4,15 +4,15 @@ import dataclasses
 import sys
 from collections.abc import Callable
 
-from jaxhom.generalization import (
+from jaxhom.generalization.generalization import (
     Generalization,
     class_similarity,
     maximum_entropy,
     nearest_neighbors,
     soft_local_homomorphism,
 )
-from jaxhom.global_homomorphism import soft_homomorphism
-from jaxhom.occupancy_regression import occupancy_regression
+from jaxhom.generalization.regression import occupancy_regression
+from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 
 
 def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, **settings):

@@ -8,8 +8,8 @@ import importlib
 import numpy as np
 
 from jaxhom.cli.sources import Problem
-from jaxhom.domains import Racetrack
-from jaxhom.occupancy import occupancy
+from jaxhom.domains.racetrack import Racetrack
+from jaxhom.planning.occupancy import occupancy
 
 KINDS = ("policy", "occupancy", "trajectories", "generalization")
 

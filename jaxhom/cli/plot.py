@@ -7,7 +7,7 @@ from jaxhom.cli import pictures
 from jaxhom.cli.options import MODEL_HELP, Parser, add_command, add_model_options
 from jaxhom.cli.results import save_figure
 from jaxhom.cli.sources import Problem, load_demonstrations_of, load_policy_of, load_problem
-from jaxhom.domains import Racetrack
+from jaxhom.domains.racetrack import Racetrack
 from jaxhom.interop.files import FileError, load_arrays
 
 _EXAMPLES = """\

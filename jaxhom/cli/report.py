@@ -5,13 +5,12 @@ import time
 
 import numpy as np
 
-from jaxhom import outward
 from jaxhom.cli.measures import measure, measures_table
 from jaxhom.cli.methods import settings_of
 from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem
 from jaxhom.cli.tables import format_facts
-from jaxhom.pdhg import Status
+from jaxhom.status import Status, bracket
 
 _MAX_RADII = 8  # that have a row each
 
@@ -71,7 +70,7 @@ class Report:
             rows.append((f"  advice from radius {levels[shown]} to {levels[-1]}", str(counts[shown:].sum())))
         rows.append(("states without a vote (uniform policy)", _share(nothing)))
         if "error_lower" in numbers:
-            rows.append(("error of the map", outward.bracket(numbers["error_lower"], numbers["error_upper"])))
+            rows.append(("error of the map", bracket(numbers["error_lower"], numbers["error_upper"])))
         if "pairs_of_classes_solved" in numbers:
             solved = f"{numbers['classes_of_local_models']}, {numbers['pairs_of_classes_solved']}"
             rows.append(("classes of local models, pairs of them solved", solved))

@@ -17,17 +17,18 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.cli.options import environment_options
-from jaxhom.demonstrations import Demonstrations, sample_demonstrations
-from jaxhom.domains import Racetrack, TileMap, racetrack
+from jaxhom.domains.racetrack import Racetrack, racetrack
+from jaxhom.domains.tile_map import TileMap
 from jaxhom.domains.track_maps import SHIPPED
-from jaxhom.impossible_steps import ImpossibleStepsWarning
-from jaxhom.inputs import check_policy
 from jaxhom.interop.environment_maps import tile_map
 from jaxhom.interop.environments import from_gymnasium, make_environment, require_steps_of_table
 from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, load_mdp, load_policy
 from jaxhom.interop.trajectories import demonstrations_from_csv
-from jaxhom.mdp import MDP, absorbing_states
-from jaxhom.planning import Plan, optimal_policy
+from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
+from jaxhom.models.impossible_steps import ImpossibleStepsWarning
+from jaxhom.models.inputs import check_policy
+from jaxhom.models.mdp import MDP, absorbing_states
+from jaxhom.planning.optimal import Plan, optimal_policy
 
 _DISCOUNT = 0.99
 _TRACK_STEPS = 20  # of a demonstration on a racetrack, and of a trial below, as in the paper

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 ACTIONS = ("up", "down", "left", "right")
 _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])

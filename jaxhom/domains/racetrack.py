@@ -39,7 +39,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.domains.track_maps import read_map
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 ACTIONS = ("nothing", "up", "down", "left", "right")
 SHIPPED_STARTS = {"a": ((7, 0),), "b": None}

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 
 @jax.tree_util.register_dataclass

@@ -9,7 +9,7 @@ Their tables hold no geometry; it is in attributes that only these two have.
 import numpy as np
 
 from jaxhom.domains.tile_map import TileMap
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 _UP, _DOWN, _LEFT, _RIGHT = (-1, 0), (1, 0), (0, -1), (0, 1)
 _LAKE_LETTERS = {b"S": "S", b"F": ".", b"H": "#", b"G": "F"}

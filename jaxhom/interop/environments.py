@@ -26,7 +26,7 @@ import numpy as np
 import scipy.sparse
 
 from jaxhom import checks
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 _OUTSIDE_THE_TABLE = ("fickle_passenger",)  # options of Gymnasium's environments that act in `step` alone
 

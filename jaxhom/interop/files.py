@@ -29,8 +29,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.demonstrations import Demonstrations
-from jaxhom.mdp import MDP
+from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.mdp import MDP
 
 FORMAT_VERSION = 1
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 
 from jaxhom import checks
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 
 def from_mdptoolbox(transitions, *, discount, initial=None, features=None, allowed=None) -> MDP:

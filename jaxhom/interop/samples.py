@@ -37,7 +37,7 @@ import scipy.special
 
 from jaxhom import checks
 from jaxhom.interop.matrices import from_scipy
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 
 SUPPORTS = ("observed", "all")
 

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.demonstrations import Demonstrations, require_no_steps
 from jaxhom.interop.files import FileError
-from jaxhom.mdp import MDP
+from jaxhom.models.demonstrations import Demonstrations, require_no_steps
+from jaxhom.models.mdp import MDP
 
 COLUMNS = ("episode", "state", "action")
 STEP_COLUMNS = ("step", "t", "time", "timestep")

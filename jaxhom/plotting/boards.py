@@ -19,7 +19,7 @@ from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import ACTIONS as RACETRACK_ACTIONS
 from jaxhom.domains.racetrack import Racetrack
 from jaxhom.domains.tile_map import TileMap
-from jaxhom.mdp import MDP
+from jaxhom.models.mdp import MDP
 from jaxhom.plotting.palette import AMOUNT, FAINT, INK, ROAD, START, WALL
 
 BAR_ROOM, LEVEL_ROOM = 1.2, 2.0  # inches beside the map, for a colour bar with numbers and one with names

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxhom.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import Racetrack
+from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.plotting.boards import Board, board_of, draw_arrows, policy_at, require
 from jaxhom.plotting.palette import BLACK, BLUE, GREEN, INK, ORANGE, PURPLE, TINT, VERMILLION
 from jaxhom.plotting.pictures import plot_gridworld, plot_racetrack, plot_trajectories, unpadded

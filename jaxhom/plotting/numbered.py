@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from jaxhom import checks
-from jaxhom.demonstrations import Demonstrations
+from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.plotting.boards import require
 from jaxhom.plotting.palette import AMOUNT, BLUE, PURPLE, VERMILLION
 from jaxhom.plotting.pictures import unpadded

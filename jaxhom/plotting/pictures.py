@@ -6,9 +6,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
-from jaxhom.demonstrations import Demonstrations
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import Racetrack
+from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.plotting.boards import (
     BAR_ROOM,
     board_of,

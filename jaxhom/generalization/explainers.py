@@ -1,0 +1,222 @@
+"""How each way to generalize explains itself: from a state and what its method remembers to an `Explanation`.
+
+An explainer is called with a generalization (its policy, visited states and radii) and a state that was not
+demonstrated. What the methods decided is looked up or repeated; brackets and maps of Algorithm 1, which decides about
+classes of states, are computed for the few voters of the state that is asked about.
+"""
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+
+from jaxhom.generalization import evidence
+from jaxhom.generalization.explanation import Explanation
+from jaxhom.generalization.votes import is_nearest, square_distances
+from jaxhom.models.graph import steps_from
+from jaxhom.models.mdp import MDP
+from jaxhom.similarity.certified_maps import certified_maps
+from jaxhom.similarity.homomorphism import ClassSimilarity
+
+LEAST_SHARE = 1e-3  # of the global map, for a demonstrated state to count as a voter
+
+
+class Generalized(Protocol):
+    """What an explainer reads of a generalization: policy [S, A], visited [S] and radius [S]."""
+
+    policy: np.ndarray
+    visited: np.ndarray
+    radius: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ByHomomorphism:
+    """Algorithm 1; `asked`, bool [S], are the states that a policy was wanted for, all if None."""
+
+    mdp: MDP
+    similarity: ClassSimilarity
+    mutual: bool
+    asked: np.ndarray | None
+
+    def __call__(self, general: Generalized, state: int) -> Explanation:
+        if self.asked is not None and not self.asked[state]:
+            return _uniform(general, state, self._method(), "no policy was asked for here (`states` leaves it out)")
+        steps = steps_from(self.mdp, state)
+        radius = int(general.radius[state])
+        if radius < 0:
+            why = _met(self.mdp, general, state, steps, ", none locally similar")
+            return _uniform(general, state, self._method(), why)
+        # Those nearer were refused when their ring was reached, or the search would have ended there.
+        candidates = _experts(self.mdp, general, state)
+        candidates = candidates[steps[candidates] == radius]
+        label = self.similarity.classes.label
+        similar = self.similarity.decide(np.full(len(candidates), label[state]), label[candidates], mutual=self.mutual)
+        voters = candidates[similar]
+        here, options = np.full(len(voters), state), (self.similarity.distance, self.similarity.anchored)
+        reason = f"{_voted(voters)}, {_steps(radius)} away."
+        return dataclasses.replace(
+            _mean_of(general, state, self._method(), reason, voters, steps[voters], mdp=self.mdp),
+            forward=certified_maps(self.mdp, here, voters, *options),
+            backward=certified_maps(self.mdp, voters, here, *options) if self.mutual else None,
+        )
+
+    def _method(self) -> str:
+        similarity = self.similarity
+        kind = "anchored" if similarity.anchored else "as printed"
+        both = ", both directions" if self.mutual else ""
+        return f"Algorithm 1 (d = {similarity.distance}, epsilon = {similarity.threshold:g}, {kind}{both})"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ByHops:
+    """k-NN by steps in the model."""
+
+    mdp: MDP
+
+    def __call__(self, general: Generalized, state: int) -> Explanation:
+        method = "nearest neighbours (steps)"
+        steps = steps_from(self.mdp, state)
+        radius = int(general.radius[state])
+        if radius < 0:
+            return _uniform(general, state, method, _met(self.mdp, general, state, steps))
+        voters = _experts(self.mdp, general, state)
+        voters = voters[steps[voters] == radius]
+        reason = f"{_voted(voters)}, {_steps(radius)} away."
+        return _mean_of(general, state, method, reason, voters, steps[voters], mdp=self.mdp)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ByCoordinates:
+    """k-NN by Euclidean distance; `coordinates` is [S, D]."""
+
+    mdp: MDP
+    coordinates: np.ndarray
+
+    def __call__(self, general: Generalized, state: int) -> Explanation:
+        method = "nearest neighbours (Euclidean)"
+        experts = _experts(self.mdp, general, state)
+        if int(general.radius[state]) < 0:
+            return _uniform(general, state, method, "no demonstrated state has a vote here")
+        square = square_distances(self.coordinates[[state]], self.coordinates[experts])
+        votes_for = is_nearest(square)[0]
+        voters, distances = experts[votes_for], np.sqrt(square[0, votes_for])
+        reason = f"{_voted(voters)}, at distance {distances[0]:.4g}."
+        return _mean_of(general, state, method, reason, voters, distances, mdp=self.mdp)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ByGlobalMap:
+    """LP (8): its map [S, E] to `experts` [E], demonstrated states, and the bounds on its optimal error."""
+
+    mdp: MDP
+    experts: np.ndarray
+    mapping: np.ndarray
+    lower: float
+    upper: float
+    anchored: bool
+
+    def __call__(self, general: Generalized, state: int) -> Explanation:
+        kind = "anchored" if self.anchored else "as printed"
+        method = f"LP (8), {kind}, one map for all states with {self.lower:.3g} <= error <= {self.upper:.3g}"
+        if int(general.radius[state]) < 0:
+            why = "no demonstrated state that the map sends it to has a vote here"
+            return _uniform(general, state, method, why)
+        shares = self.mapping[state] / self.mapping[state].sum()
+        chosen = self.mapping[state] > LEAST_SHARE
+        voters = self.experts[chosen]
+        rest = shares[~chosen].sum()
+        others = f", {rest:.2g} of it to others" if rest else ""
+        reason = f"the map sends it to {_states(len(voters))}{others}."
+        distances = steps_from(self.mdp, state)[voters]
+        return _mean_of(general, state, method, reason, voters, distances, shares[chosen], mdp=self.mdp)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ByOccupancy:
+    """The regression; `occupancy` is its x [S, A], `num_experts` how many states its data are."""
+
+    occupancy: np.ndarray
+    num_experts: int
+
+    def __call__(self, general: Generalized, state: int) -> Explanation:
+        x = self.occupancy[state]
+        if int(general.radius[state]) < 0:
+            why = f"the fitted occupancy of {x.sum():.2g} is too little to read a policy off"
+            return _uniform(general, state, "regression", why)
+        reason = (
+            f"no state voted: the occupancy fitted to {_states(self.num_experts)} is {x.sum():.3g} here, "
+            "and the policy is the share of each action in it."
+        )
+        return _mean_of(general, state, "regression", reason)
+
+
+def uniform_elsewhere(general: Generalized, state: int) -> Explanation:
+    """Maximum entropy: nothing is looked for."""
+    return _uniform(general, state, "maximum entropy", "not demonstrated, and this method looks no further")
+
+
+def demonstrated(general: Generalized, state: int) -> Explanation:
+    """A demonstrated state, whatever the method: it votes for itself."""
+    reason = "demonstrated. The policy is how often the expert took each action here."
+    return _mean_of(general, state, "the demonstrations alone", reason, [state], [0.0])
+
+
+def _experts(mdp: MDP, general: Generalized, state: int) -> np.ndarray:
+    """The demonstrated states that have a vote in a state, by number."""
+    experts = np.flatnonzero(evidence.deciding(mdp, general.visited))
+    return experts[evidence.has_vote(mdp, general.policy, np.full(len(experts), state), experts)]
+
+
+def _mean_of(general, state: int, method: str, reason: str, voters=(), distances=(), weights=None, mdp=None):
+    """The mean of the voters' policies, alike if `weights` is None; of what they say that `mdp` allows in the state."""
+    voters = np.asarray(voters, int)
+    weights = np.full(len(voters), 1.0) / max(len(voters), 1) if weights is None else weights
+    policies = np.asarray(general.policy)[voters]
+    if mdp is not None and mdp.restricts_actions and len(voters):
+        policies = evidence.allowed_part(mdp, np.full(len(voters), state), policies)
+        counted = policies.sum(axis=1)
+        policies = policies / np.where(counted > 0, counted, 1.0)[:, None]
+        weights = weights * counted / (weights @ counted)
+        reason += " Votes for actions that it lacks do not count." * bool((counted < 1.0 - 1e-9).any())
+    return Explanation(
+        state=state,
+        method=method,
+        reason=reason,
+        radius=int(general.radius[state]),
+        policy=np.asarray(general.policy[state]),
+        voters=voters,
+        weights=weights,
+        voter_policies=policies,
+        distances=np.asarray(distances, float),
+    )
+
+
+def _uniform(general, state: int, method: str, why: str) -> Explanation:
+    return _mean_of(general, state, method, f"nothing was found, so the policy is uniform: {why}.")
+
+
+def _met(mdp: MDP, general, state: int, steps: np.ndarray, qualification: str = "") -> str:
+    """What the set of states within t steps had met when it stopped growing."""
+    reached = np.isfinite(steps)
+    everything = f"all states that it leads to lie within {_steps(int(steps[reached].max()))}"
+    count = int((reached & np.asarray(general.visited)).sum())
+    if not count:
+        return f"{everything}, and no demonstrated state is among them"
+    voters = int(reached[_experts(mdp, general, state)].sum())
+    if not voters:
+        return (
+            f"{everything}; {_states(count)} among them, without a vote: they absorb, or took what is not allowed here"
+        )
+    return f"{everything}; {_states(voters)} among them{qualification}"
+
+
+def _voted(voters) -> str:
+    return f"{_states(len(voters))} voted"
+
+
+def _states(count: int) -> str:
+    return f"{count} demonstrated state{'s' * (count != 1)}"
+
+
+def _steps(count: int) -> str:
+    return f"{count} step{'s' * (count != 1)}"

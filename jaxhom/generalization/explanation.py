@@ -1,0 +1,126 @@
+"""Why a state has the policy that it has: an `Explanation`, its numbers and its text.
+
+`Generalization.explain(state)` makes one (see `explainers`); `str()` of it is for people.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from jaxhom.similarity.certified_maps import CertifiedMaps
+from jaxhom.status import Status, bracket
+
+_MAX_VOTERS = 12  # of which the text shows a line each
+_MAX_MAPS = 3
+_MAX_ROWS = 10  # of a map
+_MAX_TERMS = 4  # of a row
+_LEAST_SHARE = 1e-4  # of a row, to count as more than the solver's tolerance
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Explanation:
+    """Which demonstrated states a state's policy came from, how far they are and why they had a say; NumPy.
+
+    Attributes:
+      state: the state that is explained.
+      method: what generalized, with its options, in words.
+      reason: what it did at this state, in words.
+      radius: steps that it had to look; 0 on demonstrated states, -1 where nothing was found.
+      policy: [A], the state's policy.
+      voters: int [E], the demonstrated states whose policies it is made of, by number; the state itself if it was
+        demonstrated, none where nothing was found.
+      weights: [E], their shares: policy = weights @ voter_policies, unless `reason` says otherwise.
+      voter_policies: [E, A], their policies.
+      distances: float [E], how far each is: steps, or the Euclidean distance if that was the metric.
+      forward: the map f of LP (9) from the state's local model (the source s) to that of each voter (the target s'),
+        with certified bounds on the optimal error; None where the method compares no models.
+      backward: if similarity had to be mutual, the maps from the voters' models to the state's.
+    """
+
+    state: int
+    method: str
+    reason: str
+    radius: int
+    policy: np.ndarray
+    voters: np.ndarray
+    weights: np.ndarray
+    voter_policies: np.ndarray
+    distances: np.ndarray
+    forward: CertifiedMaps | None = None
+    backward: CertifiedMaps | None = None
+
+    @property
+    def lower(self) -> np.ndarray | None:
+        """[E], lower <= e <= upper for the error e of the map to each voter; None as `forward`."""
+        return None if self.forward is None else self.forward.lower
+
+    @property
+    def upper(self) -> np.ndarray | None:
+        """[E], see `lower`."""
+        return None if self.forward is None else self.forward.upper
+
+    @property
+    def maps(self) -> np.ndarray | None:
+        """[E, n, m], see `CertifiedMaps.maps`; None as `forward`."""
+        return None if self.forward is None else self.forward.maps
+
+    def __str__(self) -> str:
+        lines = [f"State {self.state}: {self.reason}", f"Policy {_numbers(self.policy)}, by {self.method}."]
+        if len(self.voters):
+            lines += ["", *self._table()]
+        if self.forward is not None:
+            lines += ["", *self._maps()]
+        return "\n".join(lines)
+
+    def _table(self) -> list[str]:
+        """A line per voter, those with the largest shares."""
+        order = np.argsort(-self.weights, kind="stable")[:_MAX_VOTERS]
+        columns = {
+            "voter": [str(self.voters[e]) for e in order],
+            "distance": [f"{self.distances[e]:.4g}" for e in order],
+            "share": [f"{self.weights[e]:.4g}" for e in order],
+            "its policy": [_numbers(self.voter_policies[e]) for e in order],
+        }
+        if self.forward is not None:
+            columns["error e of its map"] = [_bracket(self.forward, e) for e in order]
+        if self.backward is not None:
+            columns["and of the map back"] = [_bracket(self.backward, e) for e in order]
+        width = {name: max(map(len, [name, *cells])) for name, cells in columns.items()}
+        rows = [columns, *zip(*columns.values(), strict=True)]
+        lines = ["  ".join(f"{cell:<{width[name]}}" for name, cell in zip(columns, row, strict=True)) for row in rows]
+        rest = len(self.voters) - len(order)
+        return [line.rstrip() for line in lines] + [f"... and {rest} more"] * (rest > 0)
+
+    def _maps(self) -> list[str]:
+        """The first maps, row by row."""
+        lines = [f"Map f from the local model of {self.state} (source) to that of the voter (target):"]
+        for e in range(min(len(self.voters), _MAX_MAPS)):
+            lines.append(f"  voter {self.voters[e]}: " + "; ".join(_rows(self.forward, e)))
+        rest = len(self.voters) - _MAX_MAPS
+        return lines + [f"  ... and {rest} more"] * (rest > 0)
+
+
+def _numbers(row: np.ndarray) -> str:
+    return np.array2string(row, formatter={"float": lambda x: f"{x:.3g}"}, threshold=12, separator=", ")
+
+
+def _bracket(found: CertifiedMaps, pair: int) -> str:
+    mark = "" if found.status[pair] == Status.SOLVED else " (stopped early)"
+    return bracket(found.lower[pair], found.upper[pair]) + mark
+
+
+def _rows(found: CertifiedMaps, pair: int) -> list[str]:
+    """`7 -> 12`, or `7 -> 0.5 12 + 0.4 13 + 2 more`, for each state of the source."""
+    real = found.sources[pair] >= 0
+    states = found.sources[pair][real]
+    rows = []
+    for state, shares in zip(states[:_MAX_ROWS], found.maps[pair], strict=False):
+        order = np.argsort(-shares, kind="stable")[: max((shares >= _LEAST_SHARE).sum(), 1)]
+        if shares[order[0]] > 1.0 - _LEAST_SHARE:
+            rows.append(f"{state} -> {found.targets[pair, order[0]]}")
+            continue
+        terms = [f"{shares[k]:.2g} {found.targets[pair, k]}" for k in order[:_MAX_TERMS]]
+        rest = len(order) - len(terms)
+        rows.append(f"{state} -> " + " + ".join(terms + [f"{rest} more"] * (rest > 0)))
+    rest = len(states) - len(rows)
+    return rows + [f"{rest} more states"] * (rest > 0)

@@ -1,0 +1,83 @@
+"""The soft homomorphism from a whole model to its demonstrated part as a saddle-point problem.
+
+LP (8) of Boularias and Chaib-draa 2010: maps f [S, E] from all states to the E demonstrated ones, rows summing to 1,
+
+    min_f max_{s,a,k} |sum_s'' T(s,a,s'') f(s'',k) - sum_l f(s,l) T^E(l,a,k)|,
+
+with T^E the model restricted to the demonstrated states. As for the local program, e = min_f max_{|y|_1 <= 1} <y, K f>,
+any f gives an upper and any y a lower bound. The products with T are the model's own sweeps with the E columns as
+their batch; T^E is a dense tensor.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from jaxhom.models.mdp import MDP, expected_next_value, push_forward
+from jaxhom.solvers.projections import project_l1_ball, project_simplex
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class GlobalHomomorphismProblem:
+    """One LP (8), as a batch of a single lane: points are [S, E, 1] and [S, A, E, 1].
+
+    Attributes:
+      mdp: the model.
+      restricted: [E, A, E], T^E.
+      pinned: bool [S, E]; a row with a True is fixed to that entry. All False in the program as printed.
+    """
+
+    mdp: MDP
+    restricted: jax.Array
+    pinned: jax.Array
+
+    def start(self) -> tuple[jax.Array, jax.Array]:
+        """Uniform rows, and y = 0."""
+        num_states, num_experts = self.pinned.shape
+        f = self.project_primal(jnp.zeros((num_states, num_experts, 1), self.mdp.dtype), None)
+        return f, jnp.zeros((num_states, self.mdp.num_actions, num_experts, 1), self.mdp.dtype)
+
+    def forward(self, f: jax.Array) -> jax.Array:
+        """K f."""
+        moved = expected_next_value(self.mdp, f[..., 0])
+        return (moved - jnp.einsum("sl,lak->sak", f[..., 0], self.restricted))[..., None]
+
+    def adjoint(self, y: jax.Array) -> jax.Array:
+        """K^T y."""
+        pushed = push_forward(self.mdp, y[..., 0])
+        return (pushed - jnp.einsum("sak,lak->sl", y[..., 0], self.restricted))[..., None]
+
+    def project_primal(self, point: jax.Array, step) -> jax.Array:
+        """Rows onto the simplex; pinned rows to their entry."""
+        del step
+        f = project_simplex(point[..., 0], axis=1)
+        is_pinned = self.pinned.any(axis=1, keepdims=True)
+        return jnp.where(is_pinned, self.pinned.astype(f.dtype), f)[..., None]
+
+    def project_dual(self, point: jax.Array, step) -> jax.Array:
+        """Onto the ball |y|_1 <= 1."""
+        del step
+        return project_l1_ball(point.reshape(1, -1), axes=(1,)).reshape(point.shape)
+
+    def bounds(self, f, y, forward, adjoint) -> tuple[jax.Array, jax.Array]:
+        """Certified bounds, widened by the rounding of the sums that make them."""
+        f, y, forward, adjoint = (array[..., 0] for array in (f, y, forward, adjoint))
+        num_states, num_actions, num_experts = forward.shape
+        eps = jnp.finfo(forward.dtype).eps
+        defect = jnp.abs(f.sum(axis=1) - 1.0).max()
+        upper = jnp.abs(forward).max() + 2.0 * defect + (self.mdp.probability.shape[-1] + num_experts + 2) * eps
+        lowest = jnp.where(self.pinned.any(axis=1), (self.pinned * adjoint).sum(axis=1), adjoint.min(axis=1))
+        value = lowest.sum() / jnp.maximum(jnp.abs(y).sum(), 1.0)
+        # Rounding in K^T y is relative to the |y| that is summed, whose total is 1, spread over the chains of sums.
+        rounding = 4.0 * (num_actions * num_experts + self.mdp.probability.shape[-1]) * eps
+        lower = jnp.maximum(value - rounding - jnp.sqrt(num_states) * eps, 0.0)
+        return lower[None], upper[None]
+
+    def norm_bound(self) -> jax.Array:
+        """sqrt(|K|_1 |K|_inf), from the row and column sums of T and T^E."""
+        ones = jnp.ones((self.mdp.num_states, self.mdp.num_actions), self.mdp.dtype)
+        into_states = push_forward(self.mdp, ones).max()
+        into_experts = self.restricted.sum(axis=0).max()
+        return jnp.sqrt((into_states + self.mdp.num_actions) * (1.0 + into_experts))[None]

@@ -1,0 +1,378 @@
+"""Demonstrations: padded trajectories, what the expert did where, Monte Carlo expectations, sampling.
+
+Trajectories of unequal length are padded to the longest and masked: `states`, `actions` and `mask` are [M, H]. They
+also carry how they ended: an episode that *terminated* is absorbed for good, one that was cut off (truncated) would
+have gone on.
+"""
+
+import functools
+import operator
+from collections.abc import Iterator
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.models import episode_ends, impossible_steps
+from jaxhom.models.inputs import as_model, check_policy
+from jaxhom.models.mdp import MDP, uniform_policy
+
+
+@chex.dataclass(frozen=True, kw_only=True, mappable_dataclass=False)
+class Demonstrations:
+    """M trajectories of at most H steps. Build it with `Demonstrations.from_trajectories`.
+
+    `len` is M. `demonstrations[i]` is trajectory i as a pair of NumPy arrays, as `from_trajectories` takes it; a slice
+    or an array selects some of them, as `Demonstrations`.
+
+    Attributes:
+      states: int32 [M, H], the state of each step; 0 on padding.
+      actions: int32 [M, H], the action taken there; 0 on padding.
+      mask: bool [M, H], True on the steps that happened, a prefix of every row. Taking steps out of it, such as those
+        of a car that is put back to the start, hides them from the learner and leaves the times of the others. Where
+        the last steps are taken out, so must be the final state.
+      terminated: bool [M], whether the episode ended by itself; False for all if not given. Where it is False the
+        episode was cut off, or nobody knows.
+      final_states: int32 [M], the state after the last step, in which no action was taken; -1 where it is not known,
+        for all if not given.
+    """
+
+    states: jax.Array
+    actions: jax.Array
+    mask: jax.Array
+    terminated: jax.Array | None = None
+    final_states: jax.Array | None = None
+
+    def __post_init__(self):
+        # Trees of axes or types are built through here too: what stands for the mask stands for these fields as well.
+        is_array = hasattr(self.mask, "shape") and len(self.mask.shape) > 0
+        defaults = {"terminated": (False, bool), "final_states": (-1, jnp.int32)}
+        for name, (value, dtype) in defaults.items():
+            if getattr(self, name) is None:
+                filled = jnp.full(self.mask.shape[:-1], value, dtype) if is_array else self.mask
+                object.__setattr__(self, name, filled)
+
+    @classmethod
+    def from_trajectories(cls, trajectories, terminated=None) -> "Demonstrations":
+        """Builds demonstrations from a sequence of (states, actions) pairs of integer sequences.
+
+        Args:
+          trajectories: M pairs of non-empty sequences with as many states as actions, or one more: the last is then the
+            state in which the episode ended, where no action was taken. Lengths may differ between pairs.
+          terminated: bool [M], which episodes ended by themselves; the others were cut off. False for all if None.
+
+        Raises:
+          ValueError: if there is no trajectory, one is empty or not a pair, its lengths do not fit, an entry is
+            negative or not whole (the trajectory and the step are named), `terminated` is not bool [M], or all
+            of them padded to the longest are too many steps for 32-bit indices.
+        """
+        try:
+            trajectories = list(trajectories)
+        except TypeError:
+            kind = type(trajectories).__name__
+            raise ValueError(f"trajectories must be a sequence of pairs (states, actions), got {kind}") from None
+        if not trajectories:
+            raise ValueError("at least one trajectory is needed, got none")
+        rows = [_validated_trajectory(i, pair) for i, pair in enumerate(trajectories)]
+        require_no_steps(list(enumerate(trajectories)), "trajectory")
+        if terminated is None:
+            terminated = np.zeros(len(rows), bool)
+        terminated = _require_flags("terminated", checks.as_host_array("terminated", terminated), len(rows))
+        horizon = max(len(actions) for _, actions in rows)
+        if len(rows) * horizon > checks.MAX_SLOTS:
+            raise ValueError(
+                f"{len(rows)} trajectories padded to the longest, {horizon} steps, are more than 2^31 - 2 steps: "
+                "cut the long ones into pieces"
+            )
+        states, actions = np.zeros((2, len(rows), horizon), np.int32)
+        mask, final_states = np.zeros((len(rows), horizon), bool), np.full(len(rows), -1, np.int32)
+        for i, (row_states, row_actions) in enumerate(rows):
+            length = len(row_actions)
+            states[i, :length] = row_states[:length]
+            actions[i, :length] = row_actions
+            mask[i, :length] = True
+            final_states[i] = row_states[length] if len(row_states) > length else -1
+        arrays = {"states": states, "actions": actions, "mask": mask}
+        arrays |= {"terminated": terminated, "final_states": final_states}
+        return cls(**{name: checks.to_device(array) for name, array in arrays.items()})
+
+    @property
+    def num_trajectories(self) -> int:
+        """M."""
+        return self.states.shape[-2]
+
+    @property
+    def horizon(self) -> int:
+        """H, the length of the longest trajectory (padding included)."""
+        return self.states.shape[-1]
+
+    def __len__(self) -> int:
+        return self.num_trajectories
+
+    def __getitem__(self, index):
+        try:
+            index = operator.index(index)
+        except TypeError:
+            return jax.tree.map(operator.itemgetter(index), self)
+        mask, final = np.asarray(self.mask)[index], np.asarray(self.final_states)[index]
+        states, actions = (np.asarray(array)[index][mask] for array in (self.states, self.actions))
+        return (np.append(states, final) if final >= 0 else states), actions
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        return (self[i] for i in range(len(self)))
+
+    def validate(self, mdp: MDP, impossible: str = "refuse") -> None:
+        """Raises unless the demonstrations can have happened in a model; does nothing on traced arrays.
+
+        Functions that take demonstrations call it with "warn". To have nothing of it there, filter
+        `ImpossibleStepsWarning` with the `warnings` module; to refuse, call this first.
+
+        Args:
+          mdp: the model.
+          impossible: what to do about steps of probability 0: "refuse", "warn" (an `ImpossibleStepsWarning`) or
+            "ignore". A step is s_t, a_t and the state that follows, if that is known: the mask shows the next step too,
+            or it is the final state.
+
+        Raises:
+          ValueError: naming trajectory and step, if a state or action does not exist in the model or an action is not
+            allowed in its state; if the fields' shapes do not fit; if steps are impossible, saying how many of how
+            many, and the first.
+        """
+        mdp = as_model(mdp)
+        if impossible not in impossible_steps.OPTIONS:
+            raise ValueError(f'impossible must be "refuse", "warn" or "ignore", got {checks.in_one_line(impossible)}')
+        if checks.is_traced(self):
+            return
+        self._require_shapes()
+        self._require_pairs(mdp)
+        if not checks.is_traced(mdp.next_state, mdp.probability):
+            impossible_steps.report_impossible(mdp, self, impossible)
+
+    def _require_shapes(self) -> None:
+        shape = self.states.shape
+        same = self.actions.shape == shape and self.mask.shape == shape
+        checks.require_shape("states, actions and mask", self.actions, f"{shape} alike", same)
+        for name in ("terminated", "final_states"):
+            array = getattr(self, name)
+            checks.require_shape(name, array, str(shape[:-1]), array.shape == shape[:-1])
+
+    def _require_pairs(self, mdp: MDP) -> None:
+        """Raises unless the model has every state and action, and allows the actions in their states."""
+        mask, states, actions = (np.asarray(array) for array in (self.mask, self.states, self.actions))
+        for name, array, limit in (("states", states, mdp.num_states), ("actions", actions, mdp.num_actions)):
+            inside = (array >= 0) & (array < limit)
+            message = f"must lie in [0, {limit}) (index: trajectory, step)"
+            checks.require_all(name, array, inside | ~mask, message)
+        final = np.asarray(self.final_states)
+        message = f"must lie in [0, {mdp.num_states}), or be -1 where it is not known (index: trajectory)"
+        checks.require_all("final_states", final, (final >= -1) & (final < mdp.num_states), message)
+        if mdp.restricts_actions and not checks.is_traced(mdp.allowed):
+            exists = np.asarray(mdp.allowed)[np.where(mask, states, 0), np.where(mask, actions, 0)]
+            message = "is not allowed in its state (index: trajectory, step)"
+            checks.require_all("actions", actions, exists | ~mask, message)
+
+
+def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Array, jax.Array]:
+    """Frequencies of the expert's actions in the states that were demonstrated.
+
+    Absorbing states are no exception: if steps were recorded in one, it counts as visited, and its row says what was
+    done there. That is no decision, though, and the methods that carry the expert's policy over to other states leave
+    these states out.
+
+    Args:
+      mdp: the model.
+      demonstrations: M trajectories.
+
+    Returns:
+      visited: bool [S], the states S^E that occur in the demonstrations. A final state, in which nothing was done, does
+        not count.
+      policy: [S, A], empirical action frequencies on visited states, uniform over the allowed actions elsewhere; rows
+        sum to 1.
+
+    Raises:
+      ValueError: if a state or action is out of range, or an action not allowed.
+
+    Warns:
+      ImpossibleStepsWarning: if steps have probability 0; see `Demonstrations.validate`.
+
+    Source: Boularias and Chaib-draa 2010, section V.
+    """
+    mdp = as_model(mdp)
+    demonstrations.validate(mdp, "warn")
+    shape = (mdp.num_states, mdp.num_actions)
+    # Counted in integers and divided in JAX's default type: float32 would stop counting at 2^24, float16 at 2^11.
+    weight = demonstrations.mask.astype(jnp.int32)
+    counts = jnp.zeros(shape, jnp.int32).at[demonstrations.states, demonstrations.actions].add(weight).astype(float)
+    visits = counts.sum(axis=-1, keepdims=True)
+    visited = visits[:, 0] > 0
+    frequencies = (counts / jnp.maximum(visits, 1.0)).astype(mdp.dtype)
+    return visited, jnp.where(visited[:, None], frequencies, uniform_policy(mdp))
+
+
+def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> jax.Array:
+    """Feature expectations as the demonstrations' mean, 1/M sum_m sum_t gamma^t phi(s_t, a_t), t from 0.
+
+    Where an episode terminated, the sum goes on to infinity: gamma^T phi(z) / (1 - gamma) is added, T the number of its
+    steps, z the absorbing state that it ended in, phi(z) the mean over the actions allowed there. Where the final state
+    is not known, z may be any absorbing successor of the last step, weighted by its probability. The same holds for an
+    episode that was cut off, or walked on, in an absorbing state whose features do not depend on the action. All others
+    are sums over their own steps: of a finite horizon.
+
+    Args:
+      mdp: the model, with K features.
+      demonstrations: M trajectories.
+
+    Returns:
+      [K], in the units of `feature_expectations`.
+
+    Raises:
+      ValueError: if a state or action is out of range, an action not allowed, or a trajectory terminated where the
+        model does not absorb. Under a trace such a trajectory is not continued.
+
+    Warns:
+      ImpossibleStepsWarning: if steps have probability 0; see `Demonstrations.validate`.
+
+    Source: Boularias and Chaib-draa 2010, eq. (6), with the first step counted as gamma^0.
+    """
+    mdp = as_model(mdp)
+    demonstrations.validate(mdp, "warn")
+    expectations, is_lost = _expectations(mdp, demonstrations)
+    if not checks.is_traced(is_lost):
+        episode_ends.refuse_lost(demonstrations, np.asarray(is_lost))
+    return expectations
+
+
+@jax.jit
+def _expectations(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Array, jax.Array]:
+    steps = jnp.arange(demonstrations.horizon)
+    weight = jnp.where(demonstrations.mask, mdp.discount**steps, 0.0)
+    # Weights are summed per pair first: [M, H, K] would not fit for long demonstrations and many features.
+    pairs, is_lost = episode_ends.absorbed_time(mdp, demonstrations)
+    pairs = pairs.at[demonstrations.states, demonstrations.actions].add(weight)
+    return jnp.einsum("sa,sak->k", pairs, mdp.features) / demonstrations.num_trajectories, is_lost
+
+
+def sample_demonstrations(
+    key: jax.Array, mdp: MDP, policy: jax.Array, num_trajectories: int, horizon: int, *, terminal=None
+) -> Demonstrations:
+    """Draws trajectories of a policy, started from the model's initial distribution.
+
+    Works under `jit` and `vmap`, with the counts static.
+
+    Args:
+      key: a `jax.random` key; the same key gives the same trajectories, with `terminal` up to their ends.
+      mdp: the model.
+      policy: [S, A], rows sum to 1.
+      num_trajectories: M, at least 1.
+      horizon: H, the largest number of steps of a trajectory, at least 1.
+      terminal: bool [S], states in which an episode ends: it has no step there. None if episodes are not to end; a walk
+        then goes on in absorbing states too.
+
+    Returns:
+      Demonstrations [M, H]. With `terminal`, `terminated` says which episodes ended within H steps, and `final_states`
+      where each was after its last step; without, there is no padding and final states are not kept.
+
+    Raises:
+      ValueError: if `policy` has another shape or is none, a count is below 1, or `terminal` is not bool [S] or True
+        where episodes start.
+    """
+    mdp = as_model(mdp)
+    policy = check_policy(mdp, policy, batch=False)
+    num_trajectories = checks.require_count("num_trajectories", num_trajectories)
+    horizon = checks.require_count("horizon", horizon)
+    if terminal is not None:
+        terminal = _require_flags("terminal", jnp.asarray(terminal), mdp.num_states)
+        if not checks.is_traced(terminal, mdp.initial):
+            starts = np.asarray(mdp.initial) > 0
+            message = "must be False where episodes start: one that starts there has no step"
+            checks.require_all("terminal", np.asarray(terminal), ~(starts & np.asarray(terminal)), message)
+    return _sample(key, mdp, policy, terminal, num_trajectories, horizon)
+
+
+@functools.partial(jax.jit, static_argnums=(4, 5))
+def _sample(key, mdp, policy, terminal, num_trajectories, horizon) -> Demonstrations:
+    initial_key, steps_key = jax.random.split(key)
+    lanes = (num_trajectories,)
+    uniform = jax.random.uniform(initial_key, lanes, mdp.dtype)
+    first = jax.vmap(_inverse_cdf, in_axes=(None, 0))(jnp.cumsum(mdp.initial), uniform)
+    draw = jax.vmap(_inverse_cdf)
+    ends = jnp.zeros(mdp.num_states, bool) if terminal is None else terminal
+
+    def step(state, key):
+        draw_action, draw_successor = jax.random.uniform(key, (2, *lanes), mdp.dtype)
+        action = draw(jnp.cumsum(policy[state], axis=-1), draw_action)
+        slot = draw(jnp.cumsum(mdp.probability[state, action], axis=-1), draw_successor)
+        goes_on = ~ends[state]  # an episode that has ended stays where it is
+        return jnp.where(goes_on, mdp.next_state[state, action, slot], state), (state, action, goes_on)
+
+    last, (states, actions, mask) = jax.lax.scan(step, first, jax.random.split(steps_key, horizon))
+    steps = {"states": jnp.where(mask, states, 0).T, "actions": jnp.where(mask, actions, 0).T, "mask": mask.T}
+    if terminal is None:
+        return Demonstrations(**steps)
+    return Demonstrations(**steps, terminated=ends[last], final_states=last)
+
+
+def _inverse_cdf(cumulative: jax.Array, uniform: jax.Array) -> jax.Array:
+    """First index whose cumulative weight, [N], exceeds `uniform` in [0, 1) times the total.
+
+    Scaled by the total and strictly below it: an index of probability zero is never drawn, whatever the rounding.
+    """
+    total = cumulative[-1]
+    target = jnp.minimum(uniform * total, jnp.nextafter(total, jnp.zeros_like(total)))
+    return jnp.searchsorted(cumulative, target, side="right").astype(jnp.int32)
+
+
+def require_no_steps(pairs, kind: str) -> None:
+    """Raises if nothing tells pairs (states, actions) from episodes of two steps (state, action) each.
+
+    That is so where all pairs hold two and two numbers, and are not in the form that is asked for, a tuple of two lists
+    or arrays. A single longer one shows what is meant.
+
+    Args:
+      pairs: what was given, with its position, [(position, pair), ...].
+      kind: what a pair is called in the message.
+    """
+    if pairs and all(_may_be_steps(pair) for _, pair in pairs):
+        position, pair = pairs[0]
+        raise ValueError(
+            f"{kind} {position} could be (states, actions) or two steps (state, action), got "
+            f"{checks.in_one_line(pair)}: pass a tuple of two lists or arrays, ([state, state], [action, action])"
+        )
+
+
+def _may_be_steps(pair) -> bool:
+    parts = [part for part in pair if isinstance(part, tuple | list) or (isinstance(part, np.ndarray) and part.ndim)]
+    parts = [part for part in parts if len(part) == 2]
+    if len(parts) < 2 or any(hasattr(entry, "__len__") for part in parts for entry in part):
+        return False
+    return not isinstance(pair, tuple) or all(isinstance(part, tuple) for part in parts)
+
+
+def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:
+    """Checks one (states, actions) pair."""
+    try:
+        states, actions = pair
+    except (TypeError, ValueError):
+        raise ValueError(f"trajectory {index} must be a pair (states, actions)") from None
+    states = checks.as_host_array(f"trajectory {index} states", states)
+    actions = checks.as_host_array(f"trajectory {index} actions", actions)
+    for name, array in (("states", states), ("actions", actions)):
+        checks.require_shape(f"trajectory {index} {name}", array, "[H]", array.ndim == 1)
+    if len(states) - len(actions) not in (0, 1):
+        counts = f"{len(states)} states and {len(actions)} actions"
+        raise ValueError(f"trajectory {index} has {counts}: as many are needed, or one state more, where it ended")
+    if not len(actions):
+        raise ValueError(f"trajectory {index} is empty")
+    upper = 2**31 - 1
+    states = checks.require_integers(f"trajectory {index} states", states, upper)
+    return states, checks.require_integers(f"trajectory {index} actions", actions, upper)
+
+
+def _require_flags(name: str, array, count: int):
+    """Returns `array` if it is bool [count], or raises."""
+    checks.require_shape(name, array, f"({count},)", array.shape == (count,))
+    if array.dtype != bool:
+        raise ValueError(f"{name} must be bool, got dtype {array.dtype}")
+    return array

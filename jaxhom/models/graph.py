@@ -1,0 +1,83 @@
+"""A model as its transitions of positive probability, on the host: what searches of its graph and local models read.
+
+The layouts of `MDP` give every state and action the room of the widest: a single state with thousands of successors
+makes them as large as a dense tensor. Here each state has as many entries as it has transitions.
+"""
+
+import functools
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from jaxhom.models.mdp import MDP
+
+
+class HostGraph:
+    """The E transitions of an MDP, by state, then by action.
+
+    Attributes:
+      start: int64 [S + 1], state s has the entries start[s] ... start[s + 1] - 1.
+      action: int32 [E].
+      successor: int32 [E].
+      probability: float [E], positive.
+      refused: bool [S, A], the actions that a state lacks; None where every state has all.
+    """
+
+    def __init__(self, mdp: MDP):
+        self.num_states, self.num_actions, slots = mdp.next_state.shape
+        self.dtype = mdp.dtype
+        probability, next_state = np.asarray(mdp.probability), np.asarray(mdp.next_state)
+        entry = np.flatnonzero(probability > 0)
+        self.start = np.searchsorted(entry, np.arange(self.num_states + 1, dtype=np.int64) * self.num_actions * slots)
+        self.action = (entry // slots % self.num_actions).astype(np.int32)
+        self.successor = next_state.ravel()[entry]
+        self.probability = probability.ravel()[entry]
+        self.refused = ~np.asarray(mdp.allowed) if mdp.restricts_actions else None
+
+    @functools.cached_property
+    def num_entries(self) -> np.ndarray:
+        """int64 [S]: how many transitions each state has."""
+        return np.diff(self.start)
+
+    @functools.cached_property
+    def adjacency(self) -> scipy.sparse.csr_array:
+        """Boolean [S, S]: which states one step by any action, or none, leads to."""
+        everyone = np.arange(self.num_states, dtype=np.int32)
+        index = (np.append(np.repeat(everyone, self.num_entries), everyone), np.append(self.successor, everyone))
+        # Actions that lead to the same state are added up: there may be more of them than a byte counts.
+        counts = scipy.sparse.coo_array((np.ones(len(index[0]), np.int32), index), shape=(self.num_states,) * 2)
+        return counts.tocsr().astype(bool)
+
+    def reach(self, states: np.ndarray, steps: int) -> scipy.sparse.csr_array:
+        """Boolean [P, S], sorted: row p marks the states within `steps` steps of states[p], itself included."""
+        states = np.asarray(states, np.int64)
+        ones, first = np.ones(len(states), bool), np.arange(len(states) + 1)
+        rows = scipy.sparse.csr_array((ones, states, first), shape=(len(states), self.num_states))
+        for _ in range(steps):
+            known = rows.nnz
+            rows = rows @ self.adjacency  # of booleans: "or", which does not overflow
+            if rows.nnz == known:
+                break  # everything that can be reached
+        rows.sort_indices()
+        return rows
+
+    def entries_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The transitions of states [M], one state after the other: which of the M each belongs to, and its number."""
+        counts = self.num_entries[states]
+        owner = np.repeat(np.arange(len(states), dtype=np.int64), counts)
+        shift = self.start[states] - (np.cumsum(counts) - counts)
+        return owner, np.arange(len(owner), dtype=np.int64) + shift[owner]
+
+
+def reachable_within(mdp: MDP, steps: int) -> scipy.sparse.csr_array:
+    """Boolean [S, S] matrix whose row s marks s^steps, the states within `steps` steps of s (s included).
+
+    As many entries as there are such pairs of states: with a hub at most S + S^2 of them from two steps on.
+    """
+    return HostGraph(mdp).reach(np.arange(mdp.num_states), steps)
+
+
+def steps_from(mdp: MDP, state: int) -> np.ndarray:
+    """Least number of steps by any actions from a state to every state, float [S]; infinite where none leads."""
+    return scipy.sparse.csgraph.dijkstra(HostGraph(mdp).adjacency, indices=state, unweighted=True)

@@ -1,0 +1,77 @@
+"""Whether demonstrations can have happened in a model: steps of probability 0 are found and counted, on the host.
+
+Demonstrations of another map, or whose states are numbered from 1, mostly lie within the model's range, and turn into
+a bad policy without a sign. What gives them away is the dynamics: T(s_t, a_t, s_{t+1}) = 0.
+"""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxhom.models.mdp import MDP
+
+OPTIONS = ("refuse", "warn", "ignore")
+
+
+class ImpossibleStepsWarning(UserWarning):
+    """Demonstrations have steps that the model gives probability 0."""
+
+
+class Steps(NamedTuple):
+    """P steps whose successor is known, each [P]: where they are and s, a, s'."""
+
+    trajectory: np.ndarray
+    time: np.ndarray
+    state: np.ndarray
+    action: np.ndarray
+    successor: np.ndarray
+
+
+def report_impossible(mdp: MDP, demonstrations, impossible: str) -> None:
+    """Raises `ValueError` ("refuse") or warns ("warn") if steps have probability 0, saying how many and the first."""
+    if impossible == "ignore":
+        return
+    steps = known_steps(demonstrations)
+    bad = ~_is_possible(mdp, steps)
+    if not bad.any():
+        return
+    trajectory, time, state, action, successor = (int(column[bad.argmax()]) for column in steps)
+    message = (
+        f"{bad.sum()} of {len(bad)} steps have probability 0 in this model; the first is trajectory {trajectory}, "
+        f"step {time}: state {state}, action {action}, then state {successor}. "
+        "Do the demonstrations belong to another model, or count states or actions from 1?"
+    )
+    if impossible == "refuse":
+        raise ValueError(message)
+    warnings.warn(message, ImpossibleStepsWarning, stacklevel=4)
+
+
+def known_steps(demonstrations) -> Steps:
+    """The steps that are followed by one that the mask shows too, or by a final state that is known."""
+    horizon = demonstrations.horizon
+    fields = demonstrations.states, demonstrations.actions, demonstrations.mask
+    states, actions, mask = (np.asarray(array).reshape(-1, horizon) for array in fields)
+    follows = np.full(states.shape, -1, np.int64)
+    follows[:, :-1] = np.where(mask[:, 1:], states[:, 1:], -1)
+    rows = np.flatnonzero(mask.any(axis=1))
+    last = horizon - 1 - mask[rows, ::-1].argmax(axis=1)
+    follows[rows, last] = np.asarray(demonstrations.final_states).ravel()[rows]
+    trajectory, time = np.nonzero(mask & (follows >= 0))
+    at = trajectory, time
+    return Steps(trajectory, time, states[at], actions[at], follows[at])
+
+
+def _is_possible(mdp: MDP, steps: Steps) -> np.ndarray:
+    """bool [P]: T(s, a, s') > 0; looked up among the successors of the pairs that occur, each once."""
+    probability = np.asarray(mdp.probability)
+    if mdp.is_dense:
+        return probability[steps.state, steps.action, steps.successor] > 0
+    pairs, row = np.unique(steps.state.astype(np.int64) * mdp.num_actions + steps.action, return_inverse=True)
+    width = probability.shape[-1]
+    listed = probability.reshape(-1, width)[pairs] > 0
+    successors = np.asarray(mdp.next_state).reshape(-1, width)[pairs].astype(np.int64)
+    edges = (np.arange(len(pairs))[:, None] * mdp.num_states + successors)[listed]  # ascending, as successors are
+    wanted = row * mdp.num_states + steps.successor
+    place = np.minimum(np.searchsorted(edges, wanted), len(edges) - 1)
+    return edges[place] == wanted

@@ -1,0 +1,101 @@
+"""What users pass beside a model: brought to one form, and checked, in one place for all doors of the library.
+
+Values are checked where they are concrete; under jit, vmap and grad only shapes are.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.models.mdp import MDP
+
+
+def as_model(mdp) -> MDP:
+    """The model itself, or that of an environment or domain (whatever has it as `.mdp`); the doors' first line."""
+    model = getattr(mdp, "mdp", mdp)
+    if not isinstance(model, MDP):
+        raise ValueError(f"a jaxhom.MDP is needed, or what has one as .mdp, got {type(mdp).__name__}")
+    return model
+
+
+def check_policy(mdp: MDP, policy, name: str = "policy", *, batch: bool = True) -> jax.Array:
+    """The policy as probabilities in the model's type, whatever form it was given in; every door's one check.
+
+    Args:
+      mdp: the model.
+      policy: [S, A] or, with `batch`, [B, S, A], rows sum to 1 (within `row_tolerance`, and are then
+        brought there); integers [S], the action of every state; or what has one of these as `.policy`
+        (a `Plan`, a `Generalization`).
+      name: what to call it in messages.
+      batch: whether [B, S, A] is accepted.
+
+    Raises:
+      ValueError: on another shape; where values are concrete also on entries that are NaN or negative, rows that do
+        not sum to 1, and probability on an action that is not allowed, naming the first.
+    """
+    policy = require_policy_shape(mdp, policy, name, batch=batch)
+    is_traced = checks.is_traced(mdp, policy)
+    if policy.ndim == 1:
+        if not is_traced:
+            policy = checks.require_integers(name, policy, upper=mdp.num_actions)
+        policy = jax.nn.one_hot(policy, mdp.num_actions, dtype=mdp.dtype)
+    if is_traced:
+        return jnp.asarray(policy, mdp.dtype)
+    host = checks.require_distribution(name, np.asarray(policy))
+    if mdp.restricts_actions:
+        checks.require_all(name, host, (host == 0) | np.asarray(mdp.allowed), "is an action that is not allowed there")
+    return checks.to_device(host, mdp.dtype)
+
+
+def require_policy_shape(mdp: MDP, policy, name: str = "policy", *, batch: bool = True):
+    """The policy as an array of one of the forms of `check_policy`, its values not looked at; or `ValueError`."""
+    policy = getattr(policy, "policy", policy)
+    if not isinstance(policy, jax.core.Tracer):
+        policy = checks.as_host_array(name, policy)
+    states, actions = mdp.num_states, mdp.num_actions
+    if policy.shape == (states,) and jnp.issubdtype(policy.dtype, jnp.integer):
+        return policy
+    good = policy.ndim in ((2, 3) if batch else (2,)) and policy.shape[-2:] == (states, actions)
+    checks.require_shape(name, policy, f"({states}, {actions})" + f" or (B, {states}, {actions})" * batch, good)
+    return policy
+
+
+def check_reward(mdp: MDP, reward, policy_shape: tuple[int, ...]) -> jax.Array:
+    """A reward that goes with a policy, in the model's type; 0 where an action is not allowed.
+
+    Args:
+      mdp: the model.
+      reward: [S, A], or [B, S, A] beside a batch of policies.
+      policy_shape: (S, A) or (B, S, A).
+
+    Raises:
+      ValueError: if the shape does not fit, or a concrete value is not finite.
+    """
+    pair = (mdp.num_states, mdp.num_actions)
+    if not checks.is_traced(reward):
+        reward = checks.as_host_array("reward", reward)
+    good = reward.shape in (pair, tuple(policy_shape))
+    checks.require_shape("reward", reward, f"{pair} or the policy's", good)
+    return check_reward_values(mdp, reward)
+
+
+def check_reward_values(mdp: MDP, reward, *, forbidden: float = 0.0, may_forbid: bool = False) -> jax.Array:
+    """Rewards [..., S, A] or [..., S] in the model's type; `forbidden` stands where an action is not allowed.
+
+    Raises:
+      ValueError: naming the first concrete value that is NaN or infinite; with `may_forbid`, -inf is accepted.
+    """
+    if checks.is_traced(reward):
+        reward = jnp.asarray(reward, mdp.dtype)
+    else:
+        host = checks.as_host_array("reward", reward)
+        with_actions = host.shape[-2:] == (mdp.num_states, mdp.num_actions)
+        if mdp.restricts_actions and with_actions and not checks.is_traced(mdp.allowed):
+            host = np.where(np.asarray(mdp.allowed), host, 0)
+        minus = (host == -np.inf) if may_forbid and host.dtype.kind == "f" else np.zeros(host.shape, bool)
+        finite = checks.require_floats_in(mdp.dtype, "reward", np.where(minus, 0, host))
+        reward = checks.to_device(np.where(minus, -np.inf, finite), mdp.dtype)
+    if mdp.restricts_actions and reward.shape[-2:] == (mdp.num_states, mdp.num_actions):
+        reward = jnp.where(mdp.allowed, reward, forbidden)
+    return reward

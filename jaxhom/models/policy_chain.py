@@ -1,0 +1,154 @@
+"""Products with a model's transitions, as weights on the edges of its graph.
+
+The edges s -> s' are the same for all policies, and mostly shared by the actions of a state: a gridworld has 16 entries
+(s, a, s') per state but 4 edges. Loops therefore first make weights on the edges, and then read one number per edge:
+for the Markov chain of a policy, P_pi(s, s') = sum_a pi(s, a) T(s, a, s'), forward and backward; for all actions at a
+time, backward, with as many weights per edge as there are actions.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom.models.padded_rows import PaddedRows, gather_sum, pad_rows, sum_rows
+
+_MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Edges:
+    """The graph of a model in the successor layout.
+
+    Attributes:
+      source, target: int32 [E], the states that each edge links, in ascending order.
+      entry: int32 [E, A], the flat (s, a, slot) entry of `probability` that action a contributes to the edge; S A N
+        where it contributes nothing.
+      outgoing: the edges of every state s; E as sentinel. incoming: those of every s'.
+    """
+
+    source: jax.Array
+    target: jax.Array
+    entry: jax.Array
+    outgoing: PaddedRows
+    incoming: PaddedRows
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PolicyChain:
+    """P_pi of one policy, or of B with weights that have a trailing axis [B]."""
+
+    successor: PaddedRows
+    successor_weight: PaddedRows
+    predecessor: PaddedRows
+    predecessor_weight: PaddedRows
+
+    def expected_next_value(self, value: jax.Array) -> jax.Array:
+        """P_pi v, [S] -> [S] or [S, B] -> [S, B]."""
+        return sum_rows(self.successor, self.successor_weight, value)
+
+    def push_forward(self, occupancy: jax.Array) -> jax.Array:
+        """P_pi^T mu, [S] -> [S] or [S, B] -> [S, B]."""
+        return sum_rows(self.predecessor, self.predecessor_weight, occupancy)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ActionChains:
+    """T(s, a, s') for all actions.
+
+    Attributes:
+      successor: int32 [U, S], the first U successors of every state.
+      weight: [A, U, S], their probabilities under each action.
+      wide_row, wide, wide_weight: int32 [J], int32 [J, V] and [A, J, V], what is beyond U; see `PaddedRows`.
+    """
+
+    successor: jax.Array
+    weight: jax.Array
+    wide_row: jax.Array
+    wide: jax.Array
+    wide_weight: jax.Array
+
+    def expected_next_values(self, value: jax.Array) -> list[jax.Array]:
+        """A arrays E[v(s') | s, a], [S] -> [S] or [S, B] -> [S, B]."""
+        spread = (..., None) if value.ndim == 2 else ...
+        gathered = [value[states] for states in self.successor]
+        expected = [
+            sum(weight[spread] * at for weight, at in zip(weights, gathered, strict=True)) for weights in self.weight
+        ]
+        if not self.wide_row.size:
+            return expected
+        beyond = [gather_sum(self.wide, weight, value) for weight in self.wide_weight]
+        return [one.at[self.wide_row].add(more) for one, more in zip(expected, beyond, strict=True)]
+
+
+def find_edges(next_state: np.ndarray, probability: np.ndarray) -> Edges:
+    """The edges of successors [S, A, N] without repetitions in a row."""
+    num_states, num_actions, slots = next_state.shape
+    used = np.flatnonzero(probability > 0)
+    pair = used // slots
+    key = (pair // num_actions) * num_states + next_state.ravel()[used]
+    keys, edge = np.unique(key, return_inverse=True)
+    source, target = np.divmod(keys, num_states)
+    entry = np.full((len(keys), num_actions), next_state.size, np.int32)
+    entry[edge, pair % num_actions] = used
+    number = np.arange(len(keys))
+    return Edges(
+        source=source.astype(np.int32),
+        target=target.astype(np.int32),
+        entry=entry,
+        outgoing=pad_rows(number, source, num_states, len(keys)),
+        incoming=pad_rows(number, target, num_states, len(keys)),
+    )
+
+
+def policy_chain(edges: Edges, probability: jax.Array, policy: jax.Array) -> PolicyChain:
+    """The chain of a policy [S, A], or of a batch that comes last, [S, A, B], for probabilities [S, A, N]."""
+    entries = jnp.append(probability.ravel(), jnp.zeros((), probability.dtype))  # the sentinel's 0
+    batch = policy.shape[2:]
+    if policy.shape[1] > _MAX_UNROLLED_ACTIONS:
+        weight = jnp.einsum("ea...,ea->e...", policy[edges.source], entries[edges.entry])
+    else:
+        weight = sum(
+            policy[edges.source, a] * entries[edges.entry[:, a]].reshape(-1, *(1,) * len(batch))
+            for a in range(policy.shape[1])
+        )
+    weight = jnp.concatenate([weight, jnp.zeros((1, *batch), weight.dtype)])
+    source, target = (jnp.append(states, 0) for states in (edges.source, edges.target))
+    return PolicyChain(
+        successor=edges.outgoing.lookup(target),
+        successor_weight=edges.outgoing.lookup(weight),
+        predecessor=edges.incoming.lookup(source),
+        predecessor_weight=edges.incoming.lookup(weight),
+    )
+
+
+def action_chains(edges: Edges, probability: jax.Array) -> ActionChains:
+    """The chains of all actions, for probabilities [S, A, N]."""
+    entries = jnp.append(probability.ravel(), jnp.zeros((), probability.dtype))
+    num_actions = edges.entry.shape[1]
+    nothing = jnp.full((1, num_actions), probability.size, edges.entry.dtype)
+    weight = entries[jnp.concatenate([edges.entry, nothing])]
+    rows = edges.outgoing.lookup(weight)
+    target = edges.outgoing.lookup(jnp.append(edges.target, 0))
+    chains = ActionChains(
+        successor=target.narrow.T,
+        weight=jnp.moveaxis(rows.narrow, 0, -1).swapaxes(0, 1),
+        wide_row=target.wide_row,
+        wide=target.wide,
+        wide_weight=jnp.moveaxis(rows.wide, -1, 0),
+    )
+    # Without it XLA would make the weights again in every pass of the caller's loop.
+    return jax.lax.optimization_barrier(chains)
+
+
+def saves_gathers(edges: Edges, narrow_width: int) -> bool:
+    """Whether `ActionChains` beats a pass over `narrow_width` entries per pair: it does where actions share successors.
+
+    A gathered number costs about five times as much as a weight.
+    """
+    num_actions, width = edges.entry.shape[1], edges.outgoing.narrow.shape[1]
+    return width * (1.0 + 0.2 * num_actions) < num_actions * narrow_width

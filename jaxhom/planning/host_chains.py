@@ -1,0 +1,179 @@
+"""Chains of policies on the host, in float64: linear systems that iterations do not reach, solved directly.
+
+Near a discount of 1 a chain that mixes slowly (a corridor, two recurrent classes) leaves every iteration on products
+hundreds of thousands of steps to go, where sparse LU takes one. With P_pi(s, s') = sum_a pi(s, a) T(s, a, s'),
+
+    (I - gamma P_pi)   V  = r_pi,        (I - gamma P_pi)^T mu = alpha.
+
+Rows of T are brought to sum 1 once more, in float64, and 1 - gamma P_pi(s, s) is computed as (1 - gamma) + gamma times
+the chance to leave s: nothing cancels, so float32 tables give right values at any discount that float32 can hold.
+"""
+
+import functools
+import weakref
+
+import jax
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.csgraph
+import scipy.sparse.linalg
+
+from jaxhom import checks
+from jaxhom.models.mdp import MDP
+
+_NARROW = 8.0  # bandwidth, in square roots of S, up to which elimination fills in little: roads, grids, corridors
+_MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
+_FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
+_GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
+_latest: dict = {}  # one entry at most
+
+
+def is_at_hand(*trees) -> bool:
+    """Whether work on these arrays can be done on the host: they are concrete, and JAX computes on this CPU."""
+    return not checks.is_traced(*trees) and jax.default_backend() == "cpu"
+
+
+def host_model(mdp: MDP) -> "HostModel":
+    """The model on the host; that of the latest model is kept as long as its arrays are."""
+    array, discount, model = _latest.get("model", (lambda: None, None, None))
+    if array() is not mdp.probability or discount is not mdp.discount:
+        model = HostModel(mdp)
+        _latest["model"] = (weakref.ref(mdp.probability, lambda _: _latest.clear()), mdp.discount, model)
+    return model
+
+
+class HostModel:
+    """A concrete model in NumPy and SciPy, float64.
+
+    Attributes:
+      num_states, num_actions: S, A.
+      discount: gamma.
+      rows: [S A, S], T with a row per pair, zero where an action is not allowed; sparse, or an array if the model is
+        dense.
+    """
+
+    def __init__(self, mdp: MDP):
+        self.num_states, self.num_actions = mdp.num_states, mdp.num_actions
+        self.discount = float(mdp.discount)
+        pairs = self.num_states * self.num_actions
+        probability = np.asarray(mdp.probability, np.float64).reshape(pairs, -1)
+        probability = probability / _or_one(probability.sum(axis=1))[:, None]
+        if mdp.is_dense:
+            self.rows = probability
+            return
+        is_entry = probability > 0
+        counts = np.append(0, is_entry.sum(axis=1))
+        successors = np.asarray(mdp.next_state).reshape(pairs, -1)[is_entry]
+        entries = (probability[is_entry], successors, np.cumsum(counts))
+        self.rows = scipy.sparse.csr_array(entries, shape=(pairs, self.num_states))
+
+    def expected_next_value(self, value: np.ndarray) -> np.ndarray:
+        """E[value(s') | s, a], [S] -> [S, A]."""
+        return (self.rows @ value).reshape(self.num_states, self.num_actions)
+
+    def chain(self, policy: np.ndarray) -> "HostChain":
+        """The chain of a policy [S, A], or of the actions [S] that a deterministic one takes."""
+        states = np.arange(self.num_states)
+        if policy.ndim == 1:
+            return HostChain(self.rows[states * self.num_actions + policy], self.discount)
+        policy = np.asarray(policy, np.float64)
+        if not scipy.sparse.issparse(self.rows):
+            transition = np.einsum("sa,saz->sz", policy, self.rows.reshape(*policy.shape, -1))
+            return HostChain(transition, self.discount)
+        state, action = np.nonzero(policy)
+        entries = (policy[state, action], (state, state * self.num_actions + action))
+        choice = scipy.sparse.csr_array(entries, shape=(self.num_states, len(states) * self.num_actions))
+        return HostChain(choice @ self.rows, self.discount)
+
+    @functools.cached_property
+    def bandwidth(self) -> int:
+        """How far apart linked states are in a good order of the states: what elimination fills in."""
+        if not scipy.sparse.issparse(self.rows):
+            return self.num_states
+        owner = np.repeat(np.arange(len(self.rows.indptr) - 1) // self.num_actions, np.diff(self.rows.indptr))
+        ones = np.ones(len(owner), np.float32)
+        links = scipy.sparse.coo_array((ones, (owner, self.rows.indices)), shape=(self.num_states,) * 2).tocsr()
+        order = scipy.sparse.csgraph.reverse_cuthill_mckee(links, symmetric_mode=False)
+        place = np.empty(self.num_states, np.int64)
+        place[order] = np.arange(self.num_states)
+        return int(np.abs(place[owner] - place[self.rows.indices]).max(initial=0))
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether sparse LU is the quickest way: graphs like roads, grids and corridors."""
+        return self.bandwidth <= _NARROW * np.sqrt(self.num_states)
+
+    def solves_sooner(self, lanes: int) -> bool:
+        """Whether the host should be asked before the device for so many linear systems.
+
+        A program takes half a second to compile, and hundreds of products where the chain mixes slowly.
+        """
+        is_near_one = self.discount > _MODERATE_DISCOUNT
+        return (lanes <= _FEW_LANES or is_near_one) and self.is_narrow and self.is_solvable
+
+    def plans_sooner(self, lanes: int) -> bool:
+        """Whether the host should be asked first for the best policies of so many rewards."""
+        is_small = self.num_states <= _FEW_STATES or self.discount > _MODERATE_DISCOUNT
+        return lanes <= _FEW_LANES and is_small and self.is_narrow and self.is_solvable
+
+    @property
+    def is_solvable(self) -> bool:
+        """Whether a factor fits into memory."""
+        return float(self.num_states) * self.bandwidth <= _MAX_ENTRIES
+
+
+class HostChain:
+    """One chain P_pi, factorised: solves with I - gamma P_pi and with its transpose."""
+
+    def __init__(self, transition, discount: float):
+        self._discount = discount
+        if not scipy.sparse.issparse(transition):
+            self._transition = transition / _or_one(transition.sum(axis=1))[:, None]
+            leaving = self._transition - np.diag(self._transition.diagonal())
+            keeps = (1.0 - discount) + discount * leaving.sum(axis=1)
+            self._factor = scipy.linalg.lu_factor(np.diag(keeps) - discount * leaving)
+            return
+        size, pointers, successor = transition.shape[0], transition.indptr, transition.indices
+        states = np.arange(size)
+        state = np.repeat(states, np.diff(pointers))
+        chance = transition.data / _or_one(np.bincount(state, transition.data, size))[state]
+        self._transition = scipy.sparse.csr_array((chance, successor, pointers), shape=transition.shape)
+        leaves = successor != state
+        keeps = (1.0 - discount) + discount * np.bincount(state[leaves], chance[leaves], size)
+        numbers = np.concatenate([-discount * chance[leaves], keeps])
+        row, column = np.append(state[leaves], states), np.append(successor[leaves], states)
+        # The transpose, by columns as SuperLU wants it. No pivoting: the diagonal dominates.
+        columns = scipy.sparse.csc_array((numbers, (column, row)), shape=transition.shape)
+        self._factor = scipy.sparse.linalg.splu(
+            columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+
+    def value(self, reward: np.ndarray) -> np.ndarray:
+        """V of rewards r_pi, [S] -> [S]; NaN where rounding leaves more than a thousandth open."""
+        return self._checked(reward, is_flow=False)
+
+    def state_occupancy(self, initial: np.ndarray) -> np.ndarray:
+        """mu of an initial distribution, [S] -> [S]; likewise."""
+        return np.maximum(self._checked(initial, is_flow=True), 0.0)
+
+    def _checked(self, right: np.ndarray, is_flow: bool) -> np.ndarray:
+        solution = self._solve(right, is_flow)
+        step = self._transition.T @ solution if is_flow else self._transition @ solution
+        missing = right - solution + self._discount * step
+        # |(I - gamma P)^-1| is 1 / (1 - gamma) in the norm of sums for flows, and in that of maxima for values.
+        norm = (lambda v: np.abs(v).sum()) if is_flow else (lambda v: np.abs(v).max())
+        size = max(norm(solution), norm(right))
+        if not norm(missing) <= _GOOD_ENOUGH * (1.0 - self._discount) * size + np.finfo(float).tiny:
+            return np.full_like(solution, np.nan)
+        return solution
+
+    def _solve(self, right: np.ndarray, is_flow: bool) -> np.ndarray:
+        if isinstance(self._factor, tuple):
+            return scipy.linalg.lu_solve(self._factor, right, trans=1 if is_flow else 0)
+        return self._factor.solve(right, "N" if is_flow else "T")
+
+
+def _or_one(total: np.ndarray) -> np.ndarray:
+    """Sums to divide by; 1 where nothing was added up."""
+    return np.where(total > 0, total, 1.0)

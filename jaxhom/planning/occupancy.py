@@ -1,0 +1,142 @@
+"""Occupancy measures, feature expectations and policy values by jitted linear solves.
+
+With P_pi(s, s') = sum_a pi(s, a) T(s, a, s'), the state occupancy mu and the value V of a reward r are the
+solutions of a linear system and of its transpose:
+
+    (I - gamma P_pi)^T mu = alpha,   x(s, a) = mu(s) pi(s, a)        (the flow, Boularias and Chaib-draa eq. 3)
+    (I - gamma P_pi)   V  = r_pi,    r_pi(s) = sum_a pi(s, a) r(s, a)
+
+Concrete policies on graphs like roads, grids and corridors are solved by sparse LU in float64 on the host
+(`host_chains`), and so is what iterations leave open; everything else, and everything under jit, vmap and grad, by
+`chain_solver`. A solution that nobody can vouch for (a policy that holds NaN, say) comes back as NaN, never as a wrong
+number. Derivatives are implicit (one more solve with the transpose), whatever the method.
+
+Policies are [S, A] or a batch [B, S, A]; inside, the batch is the last axis.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.models.inputs import as_model, check_policy, check_reward, require_policy_shape
+from jaxhom.models.mdp import MDP
+from jaxhom.planning.chain_solver import solve_chain
+from jaxhom.planning.host_chains import host_model, is_at_hand
+
+
+def occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
+    """Discounted state-action occupancy x(s, a) = E sum_t gamma^t 1[s_t = s, a_t = a].
+
+    Args:
+      mdp: the model.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+
+    Returns:
+      [S, A] or [B, S, A]; each sums to 1 / (1 - discount).
+
+    Raises:
+      ValueError: if `policy` has another shape.
+
+    Source: Boularias and Chaib-draa 2010, section II and eqs. (3)-(4).
+    """
+    mdp = as_model(mdp)
+    policy = check_policy(mdp, policy)
+    if is_at_hand(mdp, policy):
+        return _solve_at_hand(mdp, policy, mdp.initial, transpose=True)[..., None] * policy
+    if policy.ndim == 3:
+        return jnp.moveaxis(_occupancy(mdp, jnp.moveaxis(policy, 0, -1)), -1, 0)
+    return _occupancy(mdp, policy)
+
+
+def feature_expectations(mdp: MDP, policy: jax.Array) -> jax.Array:
+    """Discounted feature expectations V_i(pi) = sum_{s, a} x_pi(s, a) phi_i(s, a).
+
+    Args:
+      mdp: the model, with K features.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+
+    Returns:
+      [K] or [B, K]; divide by 1 / (1 - discount) for a weighted average per step.
+
+    Raises:
+      ValueError: if `policy` has another shape.
+
+    Source: Boularias and Chaib-draa 2010, section II.
+    """
+    mdp = as_model(mdp)
+    return jnp.einsum("...sa,sak->...k", occupancy(mdp, policy), mdp.features)
+
+
+def policy_value(mdp: MDP, policy: jax.Array, reward: jax.Array) -> jax.Array:
+    """State values V(s) = E[sum_t gamma^t r(s_t, a_t) | s_0 = s] of a policy.
+
+    Args:
+      mdp: the model.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+      reward: [S, A], or [B, S, A] beside a batch of policies.
+
+    Returns:
+      [S] or [B, S].
+
+    Raises:
+      ValueError: if the shapes do not fit.
+
+    Source: Boularias and Chaib-draa 2010, section II.
+    """
+    mdp = as_model(mdp)
+    policy = require_policy_shape(mdp, policy)
+    reward = check_reward(mdp, reward, policy.shape)
+    policy = check_policy(mdp, policy)
+    reward_under_policy = (policy * reward).sum(axis=-1)
+    if is_at_hand(mdp, policy, reward):
+        return _solve_at_hand(mdp, policy, reward_under_policy, transpose=False)
+    if policy.ndim == 3:
+        batch_last = jnp.moveaxis(policy, 0, -1)
+        return _solve_values(mdp, batch_last, reward_under_policy.T).T
+    return _solve_values(mdp, policy, reward_under_policy)
+
+
+@functools.partial(jax.jit, static_argnames="is_quick")
+def _occupancy(mdp: MDP, policy: jax.Array, *, is_quick: bool = False) -> jax.Array:
+    """`occupancy` with the batch, if any, last: [S, A] or [S, A, B]."""
+    return _state_occupancy(mdp, policy, mdp.initial, is_quick=is_quick)[:, None] * policy
+
+
+@functools.partial(jax.jit, static_argnames="is_quick")
+def _state_occupancy(mdp: MDP, policy: jax.Array, initial: jax.Array, *, is_quick: bool = False) -> jax.Array:
+    """mu [S] or [S, B] of an initial distribution [S] or [S, B]."""
+    if initial.ndim < policy.ndim - 1:
+        initial = initial[:, None]
+    initial = jnp.broadcast_to(initial, policy.shape[:1] + policy.shape[2:])
+    solution = solve_chain(mdp, policy, initial, transpose=True, is_quick=is_quick)
+    # Rounding can leave -1e-17 where nothing goes; lifted without touching the derivative.
+    return solution + jax.lax.stop_gradient(jnp.maximum(solution, 0.0) - solution)
+
+
+@functools.partial(jax.jit, static_argnames="is_quick")
+def _solve_values(mdp: MDP, policy: jax.Array, source: jax.Array, *, is_quick: bool = False) -> jax.Array:
+    """Solves (I - gamma P_pi) V = source; [S] or, batch last, [S, B]."""
+    return solve_chain(mdp, policy, source, transpose=False, is_quick=is_quick)
+
+
+def _solve_at_hand(mdp: MDP, policy: jax.Array, source: jax.Array, *, transpose: bool) -> jax.Array:
+    """State occupancies (of sources that are distributions) or values of concrete policies, [S] or [B, S].
+
+    The host is asked first where it is sure to be quick, and last, for what the device could not do, where it can.
+    """
+    policies = np.asarray(policy).reshape(-1, mdp.num_states, mdp.num_actions)
+    sources = np.broadcast_to(source, (len(policies), mdp.num_states))
+    model = host_model(mdp)
+    if model.solves_sooner(len(policies)):
+        solutions = np.full(sources.shape, np.nan)
+    else:
+        solve = _state_occupancy if transpose else _solve_values
+        solutions = np.array(solve(mdp, np.moveaxis(policies, 0, -1), sources.T, is_quick=True).T)
+    (left,) = np.nonzero(np.isnan(solutions).any(axis=1))
+    for lane in left if model.is_solvable else ():
+        chain = model.chain(policies[lane])
+        solutions[lane] = (chain.state_occupancy if transpose else chain.value)(sources[lane].astype(np.float64))
+    return checks.to_device(solutions.reshape(policy.shape[:-1]), mdp.dtype)

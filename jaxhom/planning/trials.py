@@ -1,0 +1,303 @@
+"""How good a policy is: reward per step, steps to a goal, events, agreement with the expert.
+
+The measures of Boularias and Chaib-draa (2010), section VI: a policy is tried out in trials of at
+most H steps from the initial distribution, nothing is discounted, and what is reported is an
+average *per step*,
+
+    reward_per_step = E[total reward of a trial] / E[steps of a trial],
+
+a ratio of expectations: the sum over all trials by the sum of their lengths. A trial that enters a
+terminal state ends there: the step that enters counts.
+
+`evaluate_exactly` pushes the distribution of the state forward for H steps, d_{t+1} = d_t P_pi, and
+sums it up. Every measure is then linear in the visits sum_t d_t(s) pi(s, a), so one scan serves all
+of them. `evaluate_by_sampling` runs trials, as the paper does, and reports standard errors.
+"""
+
+import functools
+import operator
+from collections.abc import Mapping
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.models.demonstrations import sample_demonstrations
+from jaxhom.models.inputs import as_model, check_policy, check_reward, require_policy_shape
+from jaxhom.models.mdp import MDP, push_forward
+
+
+@chex.dataclass(frozen=True)
+class Evaluation:
+    """What a policy achieves; with a batch of B policies every number gains a leading axis [B].
+
+    Attributes:
+      reward_per_step: scalar, `total_reward` by `steps`, in units of reward; NaN if no step is
+        taken (every trial starts in a terminal state).
+      total_reward: scalar, expected undiscounted reward of a trial.
+      steps: scalar, expected steps of a trial, at most the horizon.
+      finished: scalar in [0, 1], share of trials that are in a terminal state within the horizon.
+      events: per name, a scalar: the event's expected number per trial, by `steps`.
+      standard_error: the same measures' standard errors, or None where the evaluation is exact.
+    """
+
+    reward_per_step: jax.Array
+    total_reward: jax.Array
+    steps: jax.Array
+    finished: jax.Array
+    events: dict[str, jax.Array]
+    standard_error: "Evaluation | None" = None
+
+
+def evaluate_exactly(
+    mdp: MDP,
+    policy: jax.Array,
+    reward: jax.Array,
+    horizon: int,
+    *,
+    terminal: jax.Array | None = None,
+    events: Mapping[str, jax.Array] | None = None,
+    count_terminal_step: bool = False,
+) -> Evaluation:
+    """Computes what a policy achieves in trials of at most `horizon` steps, without sampling.
+
+    Works under `jit`, `vmap` and `grad`, with `horizon` and `count_terminal_step` static.
+
+    Args:
+      mdp: the model; trials start from its initial distribution. Its discount plays no part.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+      reward: [S, A], or [B, S, A] beside a batch of policies.
+      horizon: H, the largest number of steps of a trial, at least 1.
+      terminal: bool [S], states in which a trial ends; none if None.
+      events: named arrays [S, A], the probability (or expected number) of an event in a step, the
+        racetrack's `off_road` for one.
+      count_terminal_step: whether the step that a trial would take next, from the terminal state
+        that it has entered, still counts: one more step if it falls within the horizon, with what
+        `reward` and `events` hold in that state. On a racetrack it is the step that puts the car
+        back to the start and earns nothing.
+
+    Returns:
+      An `Evaluation` without standard errors, exact up to rounding.
+
+    Raises:
+      ValueError: if a shape does not fit, `terminal` is not bool, or `horizon` is below 1.
+
+    Source: the measures of Boularias and Chaib-draa 2010, section VI.
+
+    Example:
+      >>> from jaxhom.domains.gridworld import gridworld
+      >>> from jaxhom.planning import optimal_policy
+      >>> mdp = gridworld(4, noise=0.0).mdp
+      >>> reward = jnp.zeros((16, 4)).at[:, 1].set(1.0)  # for the wish to go down
+      >>> float(evaluate_exactly(mdp, optimal_policy(mdp, reward).policy, reward, 10).total_reward)
+      10.0
+    """
+    mdp = as_model(mdp)
+    policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
+    return _evaluate_visits(
+        mdp,
+        _batch_last(policy),
+        _batch_last(reward),
+        terminal,
+        events,
+        horizon=_require_count("horizon", horizon, 1),
+        count_terminal_step=bool(count_terminal_step),
+    )
+
+
+def evaluate_by_sampling(
+    key: jax.Array,
+    mdp: MDP,
+    policy: jax.Array,
+    reward: jax.Array,
+    horizon: int,
+    *,
+    num_trials: int = 1000,
+    terminal: jax.Array | None = None,
+    events: Mapping[str, jax.Array] | None = None,
+    count_terminal_step: bool = False,
+) -> Evaluation:
+    """Estimates what a policy achieves from independent trials of at most `horizon` steps.
+
+    What a trial adds up are expectations given its states and actions: `reward` and `events` are
+    [S, A], so that the luck of a step's outcome is in where the trial goes on and nowhere else.
+
+    All policies of a batch meet the same random numbers: lane b is what `policy[b]` alone would
+    get. Differences between policies then mostly vary less than independent trials would let them;
+    the lanes' errors are not independent, and do not average out over a batch as if they were.
+
+    Args:
+      key: a `jax.random` key; the same key gives the same trials.
+      mdp: the model; trials start from its initial distribution. Its discount plays no part.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+      reward: [S, A], or [B, S, A] beside a batch of policies.
+      horizon: H, the largest number of steps of a trial, at least 1.
+      num_trials: M, at least 2; the paper takes 1000.
+      terminal: bool [S], states in which a trial ends; none if None.
+      events: named arrays [S, A], as in `evaluate_exactly`.
+      count_terminal_step: as in `evaluate_exactly`.
+
+    Returns:
+      An `Evaluation` whose `standard_error` holds those of its means over trials. Those of the
+      ratios R / N (per step) are by the delta method: the standard error of the mean of
+      R_m - (R / N) N_m, divided by the mean of N_m. Where all trials agree they are 0.
+
+    Raises:
+      ValueError: as `evaluate_exactly`, and if `num_trials` is below 2.
+
+    Source: Boularias and Chaib-draa 2010, section VI; they report no errors.
+    """
+    mdp = as_model(mdp)
+    policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
+    horizon = _require_count("horizon", horizon, 1)
+    num_trials = _require_count("num_trials", num_trials, 2)
+
+    def evaluate(policy, reward):
+        # One state more than steps: the last step of a trial may be the one that finishes it.
+        trials = sample_demonstrations(key, mdp, policy, num_trials, horizon + 1)
+        return _evaluate_trials(trials, reward, terminal, events, count_terminal_step=bool(count_terminal_step))
+
+    if policy.ndim == 3:
+        evaluate = jax.vmap(evaluate, in_axes=(0, 0 if reward.ndim == 3 else None))
+    return evaluate(policy, reward)
+
+
+def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: jax.Array | None = None) -> jax.Array:
+    """Probability that a policy takes the expert's action, averaged over states.
+
+    In state s it is sum_a min(pi(s, a), pi_E(s, a)), one minus the total variation distance of the
+    two rows: the largest probability with which draws from the two can be made to coincide. Between
+    deterministic policies it is the share of states with the same action.
+
+    Args:
+      mdp: the model.
+      policy: [S, A] or [B, S, A], rows sum to 1.
+      expert_policy: [S, A] or [B, S, A].
+      weights: [S] or [B, S], not negative, of any positive sum: how much a state counts. Take
+        `occupancy(mdp, expert_policy).sum(-1)` for the states that the expert meets. All states
+        count alike if None.
+
+    Returns:
+      Scalar in [0, 1], or [B] if any argument is a batch.
+
+    Raises:
+      ValueError: if a shape does not fit, or a weight is negative or not finite.
+    """
+    mdp = as_model(mdp)
+    policy = require_policy_shape(mdp, policy)
+    expert_policy = require_policy_shape(mdp, expert_policy, "expert_policy")
+    weights = jnp.ones(mdp.num_states, mdp.dtype) if weights is None else checks.to_device(weights)
+    good = weights.ndim in (1, 2) and weights.shape[-1] == mdp.num_states
+    checks.require_shape("weights", weights, f"({mdp.num_states},) or (B, {mdp.num_states})", good)
+    if not checks.is_traced(weights):
+        host = checks.require_floats("weights", np.asarray(weights))
+        checks.require_all("weights", host, host >= 0, "must not be negative")
+    batches = {len(a) for a, n in ((policy, 3), (expert_policy, 3), (weights, 2)) if a.ndim == n}
+    if len(batches) > 1:
+        raise ValueError(f"batches must be of one size, got {sorted(batches)}")
+    policy, expert_policy = check_policy(mdp, policy), check_policy(mdp, expert_policy, "expert_policy")
+    shared = jnp.minimum(policy, expert_policy).sum(axis=-1)
+    return (weights * shared).sum(axis=-1) / weights.sum(axis=-1)
+
+
+@functools.partial(jax.jit, static_argnames=("horizon", "count_terminal_step"))
+def _evaluate_visits(mdp, policy, reward, terminal, events, *, horizon, count_terminal_step):
+    """`evaluate_exactly` with the batch, if any, last: policy and reward [S, A] or [S, A, B]."""
+    spread = (...,) + (None,) * (policy.ndim - 2)
+    ends = terminal.astype(mdp.dtype)[spread]
+    goes_on = 1.0 - ends
+
+    def step(state, _):
+        distribution, visits = state
+        moving = (distribution * goes_on)[:, None] * policy
+        return (push_forward(mdp, moving), visits + distribution), None
+
+    initial = jnp.broadcast_to(mdp.initial[spread], policy.shape[:1] + policy.shape[2:])
+    start = (initial, jnp.zeros_like(initial))
+    (last, visits), _ = jax.lax.scan(step, start, length=horizon)
+    # Terminal mass is not pushed on, so that `visits` holds it once, on the step after its arrival.
+    finished = jnp.minimum(((visits + last) * ends).sum(axis=0), 1.0)
+    counted = visits if count_terminal_step else visits * goes_on
+    pairs, steps = counted[:, None] * policy, counted.sum(axis=0)
+
+    def total(per_pair):
+        per_pair = per_pair if per_pair.ndim == pairs.ndim else per_pair[spread]
+        return (pairs * per_pair).sum(axis=(0, 1))
+
+    return Evaluation(
+        reward_per_step=total(reward) / steps,
+        total_reward=total(reward),
+        steps=steps,
+        finished=finished,
+        events={name: total(event) / steps for name, event in events.items()},
+    )
+
+
+@functools.partial(jax.jit, static_argnames="count_terminal_step")
+def _evaluate_trials(trials, reward, terminal, events, *, count_terminal_step):
+    """Means and standard errors of trials [M, H + 1] of one policy."""
+    horizon, dtype = trials.horizon - 1, reward.dtype
+    is_terminal = terminal[trials.states]
+    finished = is_terminal.any(axis=1)
+    arrival = jnp.where(finished, is_terminal.argmax(axis=1), horizon)  # steps that lead there
+    taken = jnp.arange(horizon) < (arrival + count_terminal_step)[:, None]  # [M, H]
+    pairs = trials.states[:, :horizon], trials.actions[:, :horizon]
+
+    def totals(per_pair):
+        return jnp.where(taken, per_pair[pairs], 0.0).sum(axis=1)
+
+    steps, rewards = taken.sum(axis=1, dtype=dtype), totals(reward)
+    both = Evaluation(  # every measure beside its standard error, [2]
+        reward_per_step=_ratio(rewards, steps),
+        total_reward=_mean(rewards),
+        steps=_mean(steps),
+        finished=_mean(finished.astype(dtype)),
+        events={name: _ratio(totals(event), steps) for name, event in events.items()},
+    )
+    mean, error = (jax.tree.map(operator.itemgetter(i), both) for i in range(2))
+    return mean.replace(standard_error=error)
+
+
+def _mean(samples: jax.Array) -> jax.Array:
+    """Mean over trials and its standard error, [M] -> [2]."""
+    return jnp.stack([samples.mean(), samples.std(ddof=1) / jnp.sqrt(len(samples))])
+
+
+def _ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+    """Ratio of the means of two [M] samples and its standard error by the delta method, [2]."""
+    ratio = numerator.mean() / denominator.mean()
+    _, error = _mean(numerator - ratio * denominator)
+    return jnp.stack([ratio, error / denominator.mean()])
+
+
+def _batch_last(array: jax.Array) -> jax.Array:
+    """[S, A] as it is, [B, S, A] -> [S, A, B]."""
+    return jnp.moveaxis(array, 0, -1) if array.ndim == 3 else array
+
+
+def _validated(mdp: MDP, policy, reward, terminal, events):
+    """Returns policy, reward, terminal [S] and events in the model's dtype, or raises."""
+    policy = require_policy_shape(mdp, policy)
+    reward = check_reward(mdp, reward, policy.shape)
+    pair = (mdp.num_states, mdp.num_actions)
+    terminal = jnp.zeros(pair[:1], bool) if terminal is None else checks.to_device(terminal)
+    checks.require_shape("terminal", terminal, str(pair[:1]), terminal.shape == pair[:1])
+    if terminal.dtype != bool:
+        raise ValueError(f"terminal must be bool, got dtype {terminal.dtype}")
+    events = {name: checks.to_device(event, mdp.dtype) for name, event in (events or {}).items()}
+    for name, event in events.items():
+        checks.require_shape(f"events[{name!r}]", event, str(pair), event.shape == pair)
+    return check_policy(mdp, policy), reward, terminal, events
+
+
+def _require_count(name: str, count, least: int) -> int:
+    """Returns `count` as an int of at least `least`, or raises."""
+    try:
+        count = operator.index(count)
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, got {count!r}") from None
+    if count < least:
+        raise ValueError(f"{name} must be at least {least}, got {count}")
+    return count

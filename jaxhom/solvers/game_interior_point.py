@@ -1,0 +1,182 @@
+"""Zero-sum matrix games by a primal-dual interior-point method, made to be stopped early.
+
+    value = min_{w in simplex} max_{q in simplex} <w, M q>,   M [K, m].
+
+As two linear programs that are each other's dual, with slacks s and d that are positive inside:
+
+    max v,  M q - v = s,  sum q = 1,       min t,  t - M^T w = d,  sum w = 1,       w s = q d = mu.
+
+Both sides stay feasible, so any iterate bounds the value on both sides: min_i (M q)_i <= value <= max_j (M^T w)_j. An
+iterate that is stopped while these are still apart lies in the middle of the strategies that are about as good, and
+not at a vertex. For column generation that is worth far more than the exact solution: the weights no longer jump
+(Gondzio, Gonzalez-Brevis and Munari 2013, "New developments in the primal-dual column generation technique").
+
+Each step is Mehrotra's predictor and corrector (1992). Its normal matrix has a row per strategy of one player: of the
+one who has fewer.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxhom.solvers.inverse_factor import inverse_factor
+
+_MAX_STEPS = 60
+_TO_BOUNDARY = 0.99
+_LEAST_CENTRING = 0.02
+_START = 0.1  # slack beyond the worst outcome, as a share of the largest payoff
+_WARM_START = 0.1  # ... and of a former solution's gap; the share of uniform strategies mixed into it, too
+
+
+@chex.dataclass(frozen=True)
+class GameSolution:
+    """Strategies and what they prove.
+
+    Attributes:
+      w: [K], probabilities of the minimising player. q: [m], of the maximising one; 0 where no strategy is.
+      lower, upper: scalars, min_i (M q)_i and max_j (M^T w)_j: the game's value lies between.
+      steps: int32 scalar.
+    """
+
+    w: jax.Array
+    q: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    steps: jax.Array
+
+
+def solve_game(
+    payoff: jax.Array, is_column: jax.Array, *, tolerance, share=0.0, bound=None, start=None
+) -> GameSolution:
+    """Solves one game; use `vmap` for many.
+
+    Args:
+      payoff: M [K, m].
+      is_column: bool [m], which columns exist; at least one.
+      tolerance: scalar, upper - lower that is close enough.
+      share, bound: an upper bound on the value of a larger game, of which this one has some of the columns: it is
+        also enough when upper - lower <= share * (bound - lower).
+      start: w [K] and q [m], strategies of a similar game, to begin near them; zeros to begin in the middle.
+
+    Returns:
+      The solution; its bounds hold, and are computed from w and q, whatever made the iteration stop.
+    """
+    num_rows, num_columns = payoff.shape
+    is_row = jnp.ones(num_rows, bool)
+    payoff = jnp.where(is_column, payoff, 0.0)
+    scale = jnp.maximum(jnp.abs(payoff).max(), jnp.finfo(payoff.dtype).tiny)
+    payoff = payoff / scale
+    bound = jnp.asarray(jnp.inf if bound is None else bound, payoff.dtype) / scale
+    goal = (jnp.asarray(tolerance, payoff.dtype) / scale, jnp.asarray(share, payoff.dtype))
+
+    def is_enough(lower, upper):
+        return upper - lower <= jnp.maximum(goal[0], jnp.where(goal[1] > 0, goal[1] * (bound - lower), 0.0))
+
+    start = (0.0, 0.0) if start is None else start
+    w, q = (jnp.broadcast_to(jnp.asarray(s, payoff.dtype), n) for s, n in zip(start, payoff.shape, strict=True))
+    if num_rows <= num_columns:
+        w, q, steps = _iterate(payoff, is_row, is_column, (w, q), is_enough)
+    else:  # the same game with the players' parts exchanged
+        q, w, steps = _iterate(-payoff.T, is_column, is_row, (q, w), lambda lower, upper: is_enough(-upper, -lower))
+    lower, upper = _bounds(payoff, is_row, is_column, w, q)
+    return GameSolution(w=w, q=q, lower=lower * scale, upper=upper * scale, steps=steps)
+
+
+def _iterate(payoff, is_row, is_column, former, is_enough):
+    """Strategies w and q that are good enough, or as good as rounding allows."""
+
+    def keep_going(carry):
+        _, (best_w, best_q), moves, steps = carry
+        return ~is_enough(*_bounds(payoff, is_row, is_column, best_w, best_q)) & moves & (steps < _MAX_STEPS)
+
+    def advance(carry):
+        point, best, _, steps = carry
+        point, is_finite = _step(payoff, is_row, is_column, point)
+        best_gap, gap = (_gap(_bounds(payoff, is_row, is_column, *pair)) for pair in (best, _strategies(point)))
+        better = is_finite & (gap < best_gap)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), _strategies(point), best)
+        return point, best, is_finite & (gap < 2.0 * best_gap), steps + 1
+
+    point = _start(payoff, is_row, is_column, former)
+    start = (point, _strategies(point), jnp.array(True), jnp.zeros((), jnp.int32))
+    _, best, _, steps = jax.lax.while_loop(keep_going, advance, start)
+    return *best, steps
+
+
+def _start(payoff, is_row, is_column, former):
+    """The former strategies, or uniform ones, pulled inside; room in both slacks: w, q, v, t."""
+    # What a former game had and this one has not would stay in the sums for ever, and spoil the bounds.
+    former = tuple(jnp.where(mask, old, 0.0) for mask, old in zip((is_row, is_column), former, strict=True))
+    is_warm = (former[0].sum() > 0) & (former[1].sum() > 0)
+    uniform = tuple(mask / mask.sum().astype(payoff.dtype) for mask in (is_row, is_column))
+    warm = jnp.where(is_warm, 1.0 - _WARM_START, 0.0)
+    w, q = (
+        warm * old / jnp.where(is_warm, old.sum(), 1.0) + (1.0 - warm) * new
+        for old, new in zip(former, uniform, strict=True)
+    )
+    lower, upper = _bounds(payoff, is_row, is_column, w, q)
+    room = jnp.where(is_warm, _WARM_START * (upper - lower), _START)
+    # Without any room, on a game that is solved already, the first step would divide by zero.
+    room = jnp.maximum(room, 64.0 * jnp.finfo(payoff.dtype).eps)
+    return w, q, lower - room, upper + room
+
+
+def _strategies(point):
+    w, q, _, _ = point
+    return w / w.sum(), q / q.sum()
+
+
+def _bounds(payoff, is_row, is_column, w, q):
+    return _least(payoff @ q, is_row), -_least(-(w @ payoff), is_column)
+
+
+def _gap(bounds):
+    return bounds[1] - bounds[0]
+
+
+def _least(values, mask):
+    return jnp.where(mask, values, jnp.inf).min()
+
+
+def _step(payoff, is_row, is_column, point):
+    """One step; the point as it was, and False, if rounding has made the step useless."""
+    w, q, v, t = point
+    # Entries that do not exist have strategy 0 and slack 1: they enter no sum.
+    s, d = jnp.where(is_row, payoff @ q - v, 1.0), jnp.where(is_column, t - w @ payoff, 1.0)
+    count = is_row.sum() + is_column.sum()
+    ratio = q / d
+    total = ratio.sum()
+    centred = payoff - ((payoff @ ratio) / total)[:, None]
+    normal = (centred * ratio) @ centred.T
+    factor = inverse_factor(normal + jnp.diag(jnp.where(is_row, s / jnp.where(is_row, w, 1.0), 1.0)))
+    behind_one = factor.T @ (factor @ is_row.astype(payoff.dtype))
+
+    def direction(goal_rows, goal_columns):
+        """The Newton move towards w s = goal_rows, q d = goal_columns."""
+        rows = jnp.where(is_row, (goal_rows - w * s) / jnp.where(is_row, w, 1.0), 0.0)
+        columns = jnp.where(is_column, (goal_columns - q * d) / d, 0.0)
+        behind = factor.T @ (factor @ (rows - centred @ columns))
+        dv = -behind.sum() / behind_one.sum()
+        dw = jnp.where(is_row, behind + dv * behind_one, 0.0)
+        lifted = dw @ payoff
+        dt = (ratio @ lifted + columns.sum()) / total
+        dd = jnp.where(is_column, dt - lifted, 0.0)
+        dq = columns - ratio * dd
+        return dw, dq, jnp.where(is_row, payoff @ dq - dv, 0.0), dd, dv, dt
+
+    mu = (w @ s + q @ d) / count
+    dw, dq, ds, dd, _, _ = direction(0.0, 0.0)
+    length = _longest(((w, dw), (q, dq), (s, ds), (d, dd)))
+    ahead = ((w + length * dw) @ (s + length * ds) + (q + length * dq) @ (d + length * dd)) / count
+    mu *= jnp.clip((ahead / mu) ** 3, _LEAST_CENTRING, 1.0)
+    dw, dq, ds, dd, dv, dt = direction(mu - dw * ds, mu - dq * dd)
+    length = jnp.minimum(1.0, _TO_BOUNDARY * _longest(((w, dw), (q, dq), (s, ds), (d, dd))))
+    moved = (w + length * dw, q + length * dq, v + length * dv, t + length * dt)
+    is_finite = jnp.isfinite(length) & jnp.isfinite(moved[0].sum() + moved[1].sum() + moved[2] + moved[3])
+    return jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), moved, point), is_finite
+
+
+def _longest(pairs) -> jax.Array:
+    """The longest step that keeps every value + step * change non-negative; at most 100."""
+    speed = jnp.stack([jnp.where(change < 0, -change / value, 0.0).max() for value, change in pairs])
+    return 1.0 / jnp.maximum(speed.max(), 0.01)

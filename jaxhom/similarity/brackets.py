@@ -1,7 +1,7 @@
 """Certified brackets of the errors of many pairs of small models, by PDHG, an interior-point method, or both.
 
 PDHG decides quickly on which side of a threshold an error lies and takes models of any size; the interior-point method
-needs about ten steps to any tolerance, each with a factorisation of the size of the map. `bracket_errors` is the one
+needs about ten steps to any tolerance, each with a factorisation of the size of the map. `choose_method` is the one
 place that chooses.
 
 Bounds are widened by the rounding of the sums behind them, which is known beforehand. Where it would take up much of
@@ -9,17 +9,21 @@ the tolerance, as in float32 it does from about ten states on, PDHG runs until i
 for that, and the points that it found are judged in float64 on the host.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
+from typing import NamedTuple
 
 import chex
 import jax
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.similarity import interior_point
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import certified_bounds
 from jaxhom.solvers import pdhg
-from jaxhom.solvers.lane_queue import solve_many
+from jaxhom.solvers.lane_queue import is_settled, solve_many
 from jaxhom.status import Status
 
 METHODS = ("auto", "pdhg", "interior_point")
@@ -35,6 +39,8 @@ _FEW_BYTES = 2**19  # more than that in a batch of a few pairs' lanes is repeate
 _SMALL_ROUNDING = 0.125  # of the tolerance: nothing is done about it
 _NOISE = 32.0  # times eps: closer than that an iteration does not come
 _INTERIOR_BYTES = 2 * 2**20
+_TIGHT = 1e-3  # wider gaps PDHG closes sooner
+_MAP_LANES = 8  # maps are asked for a few at a time
 
 
 @chex.dataclass(frozen=True)
@@ -54,6 +60,52 @@ class LocalSimilarity:
     status: np.ndarray
 
 
+class Goal(NamedTuple):
+    """How far a pair of models is to be settled, and by which means.
+
+    Attributes:
+      tolerance: largest upper - lower to settle for.
+      threshold: NaN, or epsilon: settle a pair also when e <= epsilon is decided up to the tolerance.
+      method: one of `METHODS`.
+      max_iterations: of PDHG, per pair.
+    """
+
+    tolerance: float = 1e-4
+    threshold: float = np.nan
+    method: str = "auto"
+    max_iterations: int = 100_000
+
+    @classmethod
+    def checked(cls, **fields) -> Goal:
+        """The goal, or `ValueError` where a field is out of range."""
+        goal = cls(**fields)
+        if goal.method not in METHODS:
+            raise ValueError(f"method must be one of {METHODS}, got {goal.method!r}")
+        if not goal.tolerance > 0:
+            raise ValueError(f"tolerance must be positive, got {goal.tolerance}")
+        if "threshold" in fields and not goal.threshold >= 0:
+            raise ValueError(f"threshold must not be negative, got {goal.threshold}")
+        checks.require_count("max_iterations", goal.max_iterations)
+        return goal
+
+    @property
+    def decides(self) -> bool:
+        """Whether the goal is a decision."""
+        return not np.isnan(self.threshold)
+
+    def is_met(self, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """bool [P]: whether bounds [P] are settled."""
+        return is_settled(lower, upper, self.tolerance, self.threshold)
+
+
+def choose_method(n: int, m: int, dtype, goal: Goal) -> str:
+    """How LP (9) from n to m states is solved: the interior point for tight brackets of small float64 models on a CPU."""
+    if goal.method != "auto":
+        return goal.method
+    is_small = max(n, m) <= MAX_INTERIOR_SIZE and dtype == np.float64 and jax.default_backend() == "cpu"
+    return "interior_point" if is_small and not goal.decides and goal.tolerance <= _TIGHT else "pdhg"
+
+
 def bracket_errors(
     source: np.ndarray,
     target: np.ndarray,
@@ -63,10 +115,7 @@ def bracket_errors(
     source_labels: np.ndarray | None = None,
     target_labels: np.ndarray | None = None,
     anchored: bool = True,
-    tolerance: float = 1e-4,
-    threshold: float | None = None,
-    method: str = "auto",
-    max_iterations: int = 100_000,
+    goal: Goal = Goal(),  # noqa: B008 (a tuple, it never changes)
     progress: Callable[[int], object] | None = None,
 ) -> LocalSimilarity:
     """Brackets the optimal errors of LP (9) for P pairs of models given as arrays.
@@ -75,14 +124,11 @@ def bracket_errors(
       source: [P, n, A, n], centre first; padding states have no transitions, and neither have actions that are not
         allowed.
       target: [P, m, A, m], likewise.
+      source_size, target_size: int [P], how many states are real; all if None.
       source_labels, target_labels: [P, n, A, L] and [P, m, A, L], finite, zero on padding: e also bounds
         |l(i,a) - sum_k f(i,k) l'(k,a)|. None where nothing but transitions counts.
-      source_size, target_size: int [P], how many states are real; all if None.
       anchored: require that the centre is mapped to the centre.
-      tolerance: largest upper - lower to settle for.
-      threshold: None, or epsilon: settle a pair also when e <= epsilon is decided up to the tolerance.
-      method: one of `METHODS`.
-      max_iterations: of PDHG, per pair.
+      goal: what to settle for.
       progress: called with the number of pairs that just finished.
 
     Returns:
@@ -90,45 +136,69 @@ def bracket_errors(
 
     Source: Boularias and Chaib-draa 2010, eq. (9).
     """
+    labels = (source_labels, target_labels)
+    result = _no_iterations(source, *labels)
+    if goal.decides and anchored:
+        result.lower[:] = lower_bounds_without_iterations(source, target, *labels)
+    (waiting,) = np.nonzero(~(result.lower > goal.threshold))
     progress = progress or _no_progress
-    count, n = source.shape[:2]
-    m = target.shape[1]
-    if source_size is None:
-        source_size = np.full(count, n)
-    if target_size is None:
-        target_size = np.full(count, m)
-    if threshold is not None and anchored:
-        free = lower_bounds_without_iterations(source, target, source_labels, target_labels)
-        is_open = free <= threshold
-        progress(int((~is_open).sum()))
-    else:
-        free, is_open = np.zeros(count, source.dtype), np.ones(count, bool)
-    (waiting,) = np.nonzero(is_open)
-    result = LocalSimilarity(
-        lower=free,
+    progress(len(source) - len(waiting))
+    for start in range(0, len(waiting), _CHUNK_PAIRS):
+        chunk = waiting[start : start + _CHUNK_PAIRS]
+        problem = _problem(chunk, source, target, source_size, target_size, labels, anchored)
+        found = _solve(problem, goal, progress)
+        for name in ("lower", "upper", "iterations", "status"):
+            getattr(result, name)[chunk] = getattr(found, name)
+    return result
+
+
+def find_maps(
+    source: np.ndarray,
+    target: np.ndarray,
+    *,
+    source_size: np.ndarray | None = None,
+    target_size: np.ndarray | None = None,
+    source_labels: np.ndarray | None = None,
+    target_labels: np.ndarray | None = None,
+    anchored: bool = True,
+    goal: Goal = Goal(),  # noqa: B008
+) -> tuple[LocalSimilarity, np.ndarray]:
+    """As `bracket_errors`, by PDHG, which keeps the map that proves its upper bound: [P, n, m], zero on padding."""
+    labels = (source_labels, target_labels)
+    problem = _problem(slice(None), source, target, source_size, target_size, labels, anchored)
+    found, state = _settle_by_pdhg(problem, goal, _MAP_LANES, keep=("best_primal",))
+    return found, np.moveaxis(state["best_primal"], -1, 0)
+
+
+def _problem(chunk, source, target, source_size, target_size, labels, anchored: bool) -> HomomorphismProblem:
+    """Some of the pairs, lanes last."""
+
+    def lanes_last(array):
+        return None if array is None else np.moveaxis(array[chunk], 0, -1)
+
+    def sizes(given, models):
+        return (np.full(len(models), models.shape[1]) if given is None else given)[chunk]
+
+    return HomomorphismProblem(
+        source=lanes_last(source),
+        target=lanes_last(target),
+        source_size=sizes(source_size, source),
+        target_size=sizes(target_size, target),
+        anchored=anchored,
+        source_labels=lanes_last(labels[0]),
+        target_labels=lanes_last(labels[1]),
+    )
+
+
+def _no_iterations(source, source_labels, target_labels) -> LocalSimilarity:
+    """What holds before anything is computed."""
+    count = len(source)
+    return LocalSimilarity(
+        lower=np.zeros(count, source.dtype),
         upper=_upper_bounds_without_iterations(source, source_labels, target_labels),
         iterations=np.zeros(count, np.int32),
         status=np.full(count, Status.SOLVED, np.int32),
     )
-
-    def lanes_last(array, chunk):
-        return None if array is None else np.moveaxis(array[chunk], 0, -1)
-
-    for start in range(0, len(waiting), _CHUNK_PAIRS):
-        chunk = waiting[start : start + _CHUNK_PAIRS]
-        problem = HomomorphismProblem(
-            source=lanes_last(source, chunk),
-            target=lanes_last(target, chunk),
-            source_size=source_size[chunk],
-            target_size=target_size[chunk],
-            anchored=anchored,
-            source_labels=lanes_last(source_labels, chunk),
-            target_labels=lanes_last(target_labels, chunk),
-        )
-        found = _solve(problem, method, tolerance, threshold, max_iterations, progress)
-        for name in ("lower", "upper", "iterations", "status"):
-            getattr(result, name)[chunk] = getattr(found, name)
-    return result
 
 
 def lower_bounds_without_iterations(source, target, source_labels=None, target_labels=None) -> np.ndarray:
@@ -166,109 +236,81 @@ def _upper_bounds_without_iterations(source, source_labels, target_labels) -> np
     return np.maximum(bound, width * (1.0 + 4.0 * np.finfo(source.dtype).eps)).astype(source.dtype)
 
 
-def suits_interior_point(source: jax.Array, target: jax.Array, tolerance: float) -> bool:
-    """Whether the interior-point method is the faster one for tight brackets: small models in float64 on a CPU.
-
-    Args:
-      source: [n, ...]. target: [m, ...].
-    """
-    is_small = max(source.shape[0], target.shape[0]) <= MAX_INTERIOR_SIZE
-    return is_small and tolerance <= 1e-3 and source.dtype == np.float64 and jax.default_backend() == "cpu"
-
-
-def _solve(problem, method, tolerance, threshold, max_iterations, progress) -> LocalSimilarity:
+def _solve(problem: HomomorphismProblem, goal: Goal, progress) -> LocalSimilarity:
     """Brackets of the lanes of a problem; what the interior-point method leaves open, PDHG finishes."""
-    is_tight = threshold is None and suits_interior_point(problem.source, problem.target, tolerance)
-    count = problem.source.shape[-1]
-    if method == "interior_point" or (method == "auto" and is_tight):
-        options = {"lanes": _interior_lanes(problem), "keep": ("lower", "upper", "steps"), "progress": progress}
-        limits = {"tolerance": tolerance, "threshold": threshold, "max_iterations": interior_point.MAX_ITERATIONS}
-        found = solve_many(interior_point.SOLVER, problem, **limits, **options)
-        lower, upper, iterations = found["lower"], found["upper"], found["steps"]
-        progress = _no_progress  # every pair has been counted
-    else:
-        lower, upper = np.zeros(count, problem.source.dtype), np.full(count, np.inf, problem.source.dtype)
-        iterations = np.zeros(count, np.int32)
+    (n, _, _, count), m, dtype = problem.source.shape, len(problem.target), problem.source.dtype
+    if choose_method(n, m, dtype, goal) == "pdhg":
+        return _settle_by_pdhg(problem, goal, _pdhg_lanes(problem), progress)[0]
+    found = solve_many(
+        interior_point.SOLVER,
+        problem,
+        tolerance=goal.tolerance,
+        threshold=goal.threshold,
+        max_iterations=interior_point.MAX_ITERATIONS,
+        lanes=_interior_lanes(problem),
+        keep=("lower", "upper", "steps"),
+        progress=progress,
+    )
+    lower, upper, iterations = found["lower"], found["upper"], found["steps"]
     status = np.full(count, Status.SOLVED, np.int32)
-    (rest,) = np.nonzero(~_is_settled(lower, upper, tolerance, threshold))
+    (rest,) = np.nonzero(~goal.is_met(lower, upper))
     if rest.size:
-        found = settle_by_pdhg(
-            jax.tree.map(lambda leaf: leaf[..., rest], problem),
-            tolerance=tolerance,
-            threshold=threshold,
-            max_iterations=max_iterations,
-            lanes=_pdhg_lanes(problem),
-            progress=progress,
-        )
-        lower[rest], upper[rest] = np.maximum(lower[rest], found["lower"]), np.minimum(upper[rest], found["upper"])
-        iterations[rest] = found["steps"]
-        settled = _is_settled(lower[rest], upper[rest], tolerance, threshold)
-        status[rest] = np.where(settled, Status.SOLVED, found["status"])
+        part = jax.tree.map(lambda leaf: leaf[..., rest], problem)
+        others, _ = _settle_by_pdhg(part, goal, _pdhg_lanes(problem))
+        lower[rest], upper[rest] = np.maximum(lower[rest], others.lower), np.minimum(upper[rest], others.upper)
+        iterations[rest] = others.iterations
+        status[rest] = np.where(goal.is_met(lower[rest], upper[rest]), Status.SOLVED, others.status)
     return LocalSimilarity(lower=lower, upper=upper, iterations=iterations, status=status)
 
 
-def settle_by_pdhg(
+def _settle_by_pdhg(
     problem: HomomorphismProblem,
-    *,
-    tolerance: float,
-    threshold: float | None = None,
-    max_iterations: int,
+    goal: Goal,
     lanes: int,
-    keep: tuple[str, ...] = (),
     progress: Callable[[int], object] | None = None,
-) -> dict[str, np.ndarray]:
+    keep: tuple[str, ...] = (),
+) -> tuple[LocalSimilarity, dict[str, np.ndarray]]:
     """Certified bounds of every lane, as close as asked for where the dtype allows it.
 
     Args:
       problem: NumPy arrays.
-      tolerance, threshold, max_iterations: as in `bracket_errors`.
+      goal: what to settle for.
       lanes: width of the batch.
-      keep: further fields of the engine's state to return.
       progress: called with the number of pairs that just finished.
-
-    Returns:
-      lower, upper, steps, status [P] and what `keep` names.
+      keep: fields of PDHG's state to return as well.
     """
     eps = np.finfo(problem.source.dtype).eps
     of_lower, of_upper = (float(np.max(part)) for part in problem.rounding())
     rounding = of_lower + of_upper
-    is_narrow = rounding > _SMALL_ROUNDING * tolerance
-    gap, limit = tolerance, threshold
+    is_narrow = rounding > _SMALL_ROUNDING * goal.tolerance
+    gap, limit = goal.tolerance, goal.threshold
     if is_narrow:  # ask for what the bounds would be without their widening, with room for the noise in them
-        gap = max(0.5 * tolerance, _NOISE * eps) + rounding
-        limit = None if threshold is None else threshold - of_lower + _NOISE * eps
+        gap = max(0.5 * goal.tolerance, _NOISE * eps) + rounding
+        limit = goal.threshold - of_lower + _NOISE * eps
     points = ("best_primal", "best_dual") if is_narrow else ()
     found = solve_many(
         pdhg.SOLVER,
         problem,
         tolerance=gap,
         threshold=limit,
-        max_iterations=max_iterations,
+        max_iterations=goal.max_iterations,
         lanes=lanes,
         keep=tuple({"lower", "upper", "steps", *points, *keep}),
         progress=progress or _no_progress,
     )
-    found["lower"] = np.fmax(found["lower"], 0.0)
-    (rest,) = np.nonzero(~_is_settled(found["lower"], found["upper"], tolerance, threshold))
+    lower, upper = np.fmax(found["lower"], 0.0), found["upper"]
+    (rest,) = np.nonzero(~goal.is_met(lower, upper))
     if is_narrow and rest.size:
         part = jax.tree.map(lambda leaf: leaf[..., rest], problem)
-        lower, upper = certified_bounds(part, *(found[name][..., rest] for name in points))
-        found["lower"][rest] = np.fmax(found["lower"][rest], lower)
-        found["upper"][rest] = np.fmin(found["upper"][rest], upper)
-    settled = _is_settled(found["lower"], found["upper"], tolerance, threshold)
-    unsettled = np.where(found["steps"] < max_iterations, Status.STALLED, Status.ITERATION_LIMIT)
-    return found | {"status": np.where(settled, Status.SOLVED, unsettled).astype(np.int32)}
+        proved_lower, proved_upper = certified_bounds(part, *(found[name][..., rest] for name in points))
+        lower[rest], upper[rest] = np.fmax(lower[rest], proved_lower), np.fmin(upper[rest], proved_upper)
+    unsettled = np.where(found["steps"] < goal.max_iterations, Status.STALLED, Status.ITERATION_LIMIT)
+    status = np.where(goal.is_met(lower, upper), Status.SOLVED, unsettled).astype(np.int32)
+    return LocalSimilarity(lower=lower, upper=upper, iterations=found["steps"], status=status), found
 
 
 def _no_progress(count: int) -> None:
     del count
-
-
-def _is_settled(lower, upper, tolerance, threshold) -> np.ndarray:
-    settled = upper - lower <= tolerance
-    if threshold is not None:
-        settled |= (lower > threshold) | (upper <= threshold + tolerance)
-    return settled
 
 
 def _pdhg_lanes(problem) -> int:

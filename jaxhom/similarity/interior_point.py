@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.newton import factorise
-from jaxhom.solvers.lane_queue import Solver
+from jaxhom.solvers.lane_queue import Solver, is_settled, run_lanes
 from jaxhom.solvers.programs import host_jit
 
 MAX_ITERATIONS = 60
@@ -118,27 +118,17 @@ def step(problem: HomomorphismProblem, state: InteriorPointState) -> InteriorPoi
 
 
 def is_finished(state: InteriorPointState, tolerance, threshold, max_iterations) -> jax.Array:
-    """bool [lanes]: the bracket is tight enough, the threshold decided, or the lane cannot go on."""
-    finished = (state.upper - state.lower <= tolerance) | ~state.alive | (state.steps >= max_iterations)
-    if threshold is not None:
-        finished |= (state.lower > threshold) | (state.upper <= threshold + tolerance)
-    return finished
+    """bool [lanes]: settled, or the lane cannot go on."""
+    is_lost = ~state.alive | (state.steps >= max_iterations)
+    return is_settled(state.lower, state.upper, tolerance, threshold) | is_lost
 
 
 SOLVER = Solver(init, step, is_finished, host_jit)
 
 
 def solve(problem: HomomorphismProblem, *, tolerance, max_iterations: int = MAX_ITERATIONS) -> InteriorPointState:
-    """Steps until every lane has a bracket of the tolerance or cannot go on; finished lanes stay where they are."""
-
-    def advance(state):
-        finished = is_finished(state, tolerance, None, max_iterations)
-        return jax.tree.map(lambda old, new: jnp.where(finished, old, new), state, step(problem, state))
-
-    def is_open(state):
-        return ~is_finished(state, tolerance, None, max_iterations).all()
-
-    return jax.lax.while_loop(is_open, advance, init(problem))
+    """Steps until every lane has a bracket of the tolerance or cannot go on."""
+    return run_lanes(SOLVER, problem, init(problem), tolerance=tolerance, max_iterations=max_iterations)[0]
 
 
 def _masks(problem: HomomorphismProblem) -> tuple[jax.Array, jax.Array]:

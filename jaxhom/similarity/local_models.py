@@ -1,4 +1,4 @@
-"""Local models M^{s,d} and their classes up to a renaming of states.
+"""Local models M^{s,d}: what a state leads to within d steps, as small models of their own.
 
 M^{s,d} is the model restricted to s^d, the states within d steps of s by any actions; a transition that leaves
 s^d becomes a self-loop on the state it leaves (Boularias and Chaib-draa 2010, section V). The centre s is state 0
@@ -7,13 +7,9 @@ of its local model; the others follow in ascending order; padding has no transit
 Actions that some states lack lead to one more absorbing state, "refused", that all local models share, that is mapped
 to itself and to which nothing else is mapped. That is one label per action, 1 where it is not allowed, which a map has
 to keep (`homomorphism_lp`); the rows of such actions are zero.
-
-Few local models are different: a 48 x 48 grid has nine at d = 1. `local_model_classes` finds them by their canonical
-forms (see `canonical_forms`).
 """
 
-import hashlib
-from collections.abc import Iterator
+from __future__ import annotations
 
 import chex
 import numpy as np
@@ -22,11 +18,8 @@ import scipy.sparse
 from jaxhom import checks
 from jaxhom.models.graph import HostGraph
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity.canonical_forms import canonical_forms
 
-_CHUNK_BYTES = 64 * 2**20
-_CHUNK_ENTRIES = 2**22
-_MAX_ENTRIES = 2**24  # of a transition tensor
+_MAX_ENTRIES = 2**24  # of a transition tensor: 128 MB in float64
 
 
 @chex.dataclass(frozen=True)
@@ -46,21 +39,6 @@ class LocalModels:
     labels: np.ndarray | None = None
 
 
-@chex.dataclass(frozen=True)
-class LocalModelClasses:
-    """Classes of isomorphic local models.
-
-    Attributes:
-      label: int32 [P], the class of each of the given states, numbered 0 ... C - 1.
-      representative: int32 [C], the first given state of each class.
-      size: int32 [C], the number of states of the class's model.
-    """
-
-    label: np.ndarray
-    representative: np.ndarray
-    size: np.ndarray
-
-
 def local_models(mdp: MDP, states, distance: int = 1) -> LocalModels:
     """Builds M^{s,d} for each of the given states.
 
@@ -77,21 +55,25 @@ def local_models(mdp: MDP, states, distance: int = 1) -> LocalModels:
 
     Source: Boularias and Chaib-draa 2010, section V.
     """
-    states = _validated(mdp, states, distance)
-    graph = HostGraph(mdp)
-    rows = graph.reach(states, distance)
-    return _restrict(graph, states, rows, int(np.diff(rows.indptr).max(initial=1)))
+    states = validated_states(mdp, states, distance)
+    maker = LocalModelMaker(HostGraph(mdp), distance)
+    members = maker.members(states)
+    return maker.make(states, int(np.diff(members.indptr).max(initial=1)), members)
 
 
 class LocalModelMaker:
     """Builds local models of one distance, some at a time, padded to any width."""
 
-    def __init__(self, mdp: MDP, distance: int):
-        self._graph, self._distance = HostGraph(mdp), distance
+    def __init__(self, graph: HostGraph, distance: int):
+        self.graph, self.distance = graph, distance
 
-    def make(self, states: np.ndarray, width: int) -> LocalModels:
-        """M^{s,d} of the given states, none of them larger than `width`."""
-        return _restrict(self._graph, states, self._graph.reach(states, self._distance), width)
+    def members(self, states: np.ndarray) -> scipy.sparse.csr_array:
+        """Boolean [P, S], sorted: the states of each model."""
+        return self.graph.reach(states, self.distance)
+
+    def make(self, states: np.ndarray, width: int, members: scipy.sparse.csr_array | None = None) -> LocalModels:
+        """M^{s,d} of the given states, none of them larger than `width`; `members` where they are known."""
+        return _restrict(self.graph, states, self.members(states) if members is None else members, width)
 
 
 def restricted_model(mdp: MDP, states) -> np.ndarray:
@@ -101,7 +83,7 @@ def restricted_model(mdp: MDP, states) -> np.ndarray:
 
     Source: Boularias and Chaib-draa 2010, section V.
     """
-    states = np.sort(_validated(mdp, states, 1))
+    states = np.sort(validated_states(mdp, states, 1))
     rows = scipy.sparse.csr_array(
         (np.ones(len(states), bool), (np.zeros(len(states), int), states)), shape=(1, mdp.num_states)
     )
@@ -110,98 +92,20 @@ def restricted_model(mdp: MDP, states) -> np.ndarray:
     return model.transition[0][order][..., order]
 
 
-def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelClasses:
-    """Groups states whose local models are equal up to a renaming of states that keeps the centre.
-
-    Args:
-      mdp: the model.
-      states: int [P]; all states if None.
-      distance: d >= 1.
-
-    Returns:
-      `LocalModelClasses`. Probabilities count as equal if they agree to about 12 digits (6 in float32), which
-      forgives the rounding of differently ordered sums. A model too large to be compared (`is_oversized`) is a class of
-      its own.
-
-    Raises:
-      ValueError: if a state is out of range or `distance` is below 1.
-    """
-    states = _validated(mdp, np.arange(mdp.num_states) if states is None else states, distance)
-    graph = HostGraph(mdp)
-    rows = graph.reach(states, distance)
-    sizes = np.diff(rows.indptr)
-    weights = np.add.reduceat(graph.num_entries[rows.indices], rows.indptr[:-1]) if len(states) else sizes
-    class_of_key: dict[bytes, int] = {}
-    label = np.zeros(len(states), np.int32)
-    first = []
-    for index in _chunks(sizes, weights, mdp.num_actions):
-        if is_oversized(int(sizes[index[0]]), mdp.num_actions):
-            keys = [b"state %d" % states[i] for i in index]
-        else:
-            models = _restrict(graph, states[index], rows[index], int(sizes[index[0]]))
-            forms, _ = canonical_forms(models.transition, _quantum_bits(mdp.dtype), models.labels)
-            keys = [hashlib.blake2b(form, digest_size=16).digest() for form in forms]
-        for i, key in zip(index, keys, strict=True):
-            number = class_of_key.setdefault(key, len(class_of_key))
-            if number == len(first):
-                first.append(i)
-            label[i] = number
-    first = np.array(first, int)
-    return LocalModelClasses(
-        label=label,
-        representative=states[first].astype(np.int32),
-        size=sizes[first].astype(np.int32),
-    )
-
-
-def model_rounding(dtype) -> float:
-    """Largest difference between two probabilities that `local_model_classes` takes as equal."""
-    return 2.0 ** -_quantum_bits(dtype)
-
-
-def isomorphism(one: np.ndarray, other: np.ndarray, labels=None) -> np.ndarray | None:
-    """The renaming that makes two local models equal: state i of `one` is state p[i] of `other`.
-
-    Args:
-      one: [n, A, n], centre first, no padding.
-      other: [m, A, m], likewise.
-      labels: those of both, [n, A, L] and [m, A, L]; or None.
-
-    Returns:
-      int [n], or None where the canonical forms differ. Equal up to `model_rounding`, as within a class.
-    """
-    if one.shape != other.shape:
-        return None
-    stacked = None if labels is None else np.stack(labels)
-    (key, other_key), order = canonical_forms(np.stack([one, other]), _quantum_bits(one.dtype), stacked)
-    if key != other_key:
-        return None
-    renaming = np.empty(len(one), int)
-    renaming[order[0]] = order[1]
-    return renaming
-
-
 def is_oversized(size: np.ndarray, num_actions: int) -> np.ndarray:
     """Whether a local model of so many states is too large to be told from others or mapped: hubs of thousands."""
     return np.asarray(size, np.int64) ** 2 * num_actions > _MAX_ENTRIES
 
 
-def _chunks(sizes: np.ndarray, weights: np.ndarray, num_actions: int) -> Iterator[np.ndarray]:
-    """Numbers of models of one size, as many at a time as memory allows: for their tensors, and for their entries."""
-    for size in np.unique(sizes):
-        (same,) = np.nonzero(sizes == size)
-        most = max(1, _CHUNK_BYTES // (8 * num_actions * int(size) ** 2))
-        batch = np.maximum(np.cumsum(weights[same]) // _CHUNK_ENTRIES, np.arange(len(same)) // most)
-        yield from np.split(same, np.flatnonzero(np.diff(batch)) + 1)
-
-
-def _quantum_bits(dtype) -> int:
-    return 40 if dtype == np.float64 else 20
-
-
-def _validated(mdp: MDP, states, distance: int) -> np.ndarray:
+def require_concrete(mdp: MDP) -> None:
+    """Raises `ValueError` on a traced model."""
     if checks.is_traced(mdp):
         raise ValueError("local models are found on the host: call this outside jit, vmap and grad")
+
+
+def validated_states(mdp: MDP, states, distance: int) -> np.ndarray:
+    """States [P] as integers, or `ValueError`; a traced model or a distance below 1 is refused too."""
+    require_concrete(mdp)
     checks.require_count("distance", distance)
     states = checks.as_host_array("states", states)
     checks.require_shape("states", states, "[P]", states.ndim == 1)

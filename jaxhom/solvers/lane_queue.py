@@ -1,6 +1,6 @@
 """Many problems through a fixed number of lanes: finished lanes leave, waiting problems take their place.
 
-Under one `while_loop` a batch runs until its slowest lane stops. Here the loop ends when a quarter of the lanes are
+A *lane* is one problem of a batch: one index of the last axis of every array. Under one `while_loop` a batch runs until its slowest lane stops. Here the loop ends when a quarter of the lanes are
 done, and the host takes their answers out and fills them from the queue. The batch keeps one width, so one program is
 compiled; a narrow batch (64 lanes fill the vector units of a CPU) wastes little on the last, slow lanes.
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxhom.solvers.programs import host_jit
 
-_STOP_FRACTION = 0.25
+_STOP_FRACTION = 0.25  # of the lanes: fewer and the host is asked more often, more and lanes wait
 _MAX_WORKERS = 8
 
 
@@ -32,7 +32,7 @@ class Solver(NamedTuple):
     Attributes:
       init: problem -> state.
       step: problem, state -> state.
-      is_finished: state, tolerance, threshold, max_iterations -> bool [lanes].
+      is_finished: state, tolerance, threshold, max_iterations -> bool [lanes]: settled (`is_settled`), or at an end.
       jit: how the steps are compiled; `jax.jit`, or `host_jit` where that runs as fast.
     """
 
@@ -106,6 +106,46 @@ def _num_workers(devices: Sequence[jax.Device]) -> int:
 def num_cores() -> int:
     """Programs to have under way at a time on a CPU: one per core, because XLA runs small ones on one core each."""
     return min(_MAX_WORKERS, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+
+def is_settled(lower, upper, tolerance, threshold=np.nan):
+    """bool [P]: bounds [P] are as close as `tolerance`, or decide `value <= threshold` up to it; NumPy or JAX.
+
+    Where both bounds of a decision hold, the upper one decides. A threshold of NaN decides nothing.
+    """
+    return (upper - lower <= tolerance) | (lower > threshold) | (upper <= threshold + tolerance)
+
+
+def run_lanes(solver: Solver, problem, state, *, tolerance, threshold=np.nan, max_iterations, share=1.0, used=None):
+    """Steps until `share` of the lanes are finished; those that are stay as they are, whatever runs beside them.
+
+    Args:
+      solver: the method.
+      problem: its arrays, lanes last.
+      state: from `solver.init` or a former call.
+      tolerance, threshold: scalars or [lanes], as in `is_settled`.
+      max_iterations: per lane.
+      share: of the lanes, that ends the loop.
+      used: how many of the lanes count, from the first on; all if None.
+
+    Returns:
+      The state, and bool [lanes]: which are finished.
+    """
+
+    def is_finished(state):
+        return solver.is_finished(state, tolerance, threshold, max_iterations)
+
+    def keep_going(state):
+        done = is_finished(state)
+        counted = done.size if used is None else used
+        return (done & (jnp.arange(done.size) < counted)).sum() < share * counted
+
+    def advance(state):
+        done = is_finished(state)
+        return jax.tree.map(lambda old, new: jnp.where(done, old, new), state, solver.step(problem, state))
+
+    state = jax.lax.while_loop(keep_going, advance, state)
+    return state, is_finished(state)
 
 
 class _Queue:
@@ -187,24 +227,10 @@ def _merge(state, fresh, source):
 
 @functools.cache
 def _program(solver: Solver) -> Callable:
-    """`_run` of a solver, compiled."""
-    return solver.jit(functools.partial(_run, solver))
+    """`run_lanes` of a solver until a share of the lanes is done, compiled."""
 
+    def run(problem, state, threshold, used, tolerance, max_iterations):
+        limits = {"tolerance": tolerance, "threshold": threshold, "max_iterations": max_iterations}
+        return run_lanes(solver, problem, state, **limits, share=_STOP_FRACTION, used=used)
 
-def _run(solver: Solver, problem, state, threshold, used, tolerance, max_iterations):
-    """Steps until a quarter of the `used` lanes are done; returns which."""
-
-    def is_done(state):
-        return solver.is_finished(state, tolerance, threshold, max_iterations)
-
-    def keep_going(state):
-        done = is_done(state)
-        return (done & (jnp.arange(done.size) < used)).sum() < _STOP_FRACTION * used
-
-    def advance(state):
-        # Finished lanes stay as they are: an answer does not depend on the lanes beside it.
-        done = is_done(state)
-        return jax.tree.map(lambda old, new: jnp.where(done, old, new), state, solver.step(problem, state))
-
-    state = jax.lax.while_loop(keep_going, advance, state)
-    return state, is_done(state)
+    return solver.jit(run)

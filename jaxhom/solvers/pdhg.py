@@ -25,7 +25,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxhom.solvers.lane_queue import Solver
+from jaxhom.solvers.lane_queue import Solver, is_settled, run_lanes
 from jaxhom.solvers.projections import reduce_leading
 
 _SUFFICIENT_DECAY = 0.2  # restart at once
@@ -141,54 +141,25 @@ def step(problem: Problem, state: PDHGState) -> PDHGState:
     return _restart(state, residual, mapped_primal, mapped_dual)
 
 
-def solve(
-    problem: Problem,
-    state: PDHGState,
-    *,
-    tolerance,
-    threshold=None,
-    max_iterations: int = 100_000,
-    stop_fraction: float = 1.0,
-) -> PDHGState:
-    """Steps until the given fraction of the lanes is settled (see `is_settled`) or out of iterations.
+def is_finished(state: PDHGState, tolerance, threshold, max_iterations) -> jax.Array:
+    """[lanes]: settled, or out of iterations, or without a step length because the problem is not finite."""
+    is_lost = (state.steps >= max_iterations) | jnp.isnan(state.eta)
+    return is_settled(state.lower, state.upper, tolerance, threshold) | is_lost
 
-    Lanes that are finished stay where they are: an answer does not depend on the lanes beside it.
+
+SOLVER = Solver(init, step, is_finished)
+
+
+def solve(problem: Problem, state: PDHGState, *, tolerance, max_iterations: int = 100_000) -> PDHGState:
+    """Steps from a state until every lane's gap is within the tolerance or it is out of iterations.
 
     Args:
       problem: the problem.
       state: from `init` or a former call.
       tolerance: scalar or [lanes], the gap to reach.
-      threshold: None, or [lanes]: settle also when the bounds decide `value <= threshold`.
       max_iterations: per lane.
-      stop_fraction: share of lanes that must be done for the loop to end.
     """
-    lanes = state.lower.shape[-1]
-
-    def is_done(state):
-        return is_finished(state, tolerance, threshold, max_iterations)
-
-    def advance(state):
-        done = is_done(state)
-        return jax.tree.map(lambda old, new: jnp.where(done, old, new), state, step(problem, state))
-
-    return jax.lax.while_loop(lambda s: is_done(s).sum() < jnp.ceil(stop_fraction * lanes), advance, state)
-
-
-def is_settled(state: PDHGState, tolerance, threshold=None) -> jax.Array:
-    """[lanes]: the gap is within `tolerance`, or `value <= threshold` is decided up to `tolerance`."""
-    settled = state.upper - state.lower <= tolerance
-    if threshold is None:
-        return settled
-    return settled | (state.lower > threshold) | (state.upper <= threshold + tolerance)
-
-
-def is_finished(state: PDHGState, tolerance, threshold, max_iterations) -> jax.Array:
-    """[lanes]: settled, or out of iterations, or without a step length because the problem is not finite."""
-    is_lost = (state.steps >= max_iterations) | jnp.isnan(state.eta)
-    return is_settled(state, tolerance, threshold) | is_lost
-
-
-SOLVER = Solver(init, step, is_finished)
+    return run_lanes(SOLVER, problem, state, tolerance=tolerance, max_iterations=max_iterations)[0]
 
 
 def _iterate(problem: Problem, state: PDHGState, k):

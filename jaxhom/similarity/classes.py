@@ -1,0 +1,154 @@
+"""Classes of local models that are equal up to a renaming of states which keeps the centre.
+
+Few local models are different: a 48 x 48 grid has nine at d = 1. States of one class share every error of LP (9), so
+programs are solved for pairs of classes, never for pairs of states. Classes are found by canonical forms
+(`canonical_forms`) as states are met.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+
+import chex
+import numpy as np
+
+from jaxhom.models.graph import HostGraph
+from jaxhom.models.mdp import MDP
+from jaxhom.similarity.canonical_forms import canonical_forms
+from jaxhom.similarity.local_models import LocalModelMaker, is_oversized, validated_states
+
+_CHUNK_BYTES = 64 * 2**20
+_CHUNK_ENTRIES = 2**22
+
+
+@chex.dataclass(frozen=True)
+class LocalModelClasses:
+    """Classes of isomorphic local models.
+
+    Attributes:
+      label: int32 [P], the class of each of the given states, numbered 0 ... C - 1.
+      representative: int32 [C], the first given state of each class.
+      size: int32 [C], the number of states of the class's model.
+    """
+
+    label: np.ndarray
+    representative: np.ndarray
+    size: np.ndarray
+
+
+class ClassBook:
+    """The classes of the states that have been met so far; a class once numbered keeps its number.
+
+    Args:
+      maker: builds the local models of some distance.
+    """
+
+    def __init__(self, maker: LocalModelMaker):
+        self._maker = maker
+        self._label = np.full(maker.graph.num_states, -1, np.int32)
+        self._class_of_key: dict[bytes, int] = {}
+        self._representative: list[int] = []
+        self._size: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self._size)
+
+    @property
+    def representative(self) -> np.ndarray:
+        """int32 [C], the first state that was met of each class."""
+        return np.array(self._representative, np.int32)
+
+    @property
+    def size(self) -> np.ndarray:
+        """int32 [C], the number of states of each class's model."""
+        return np.array(self._size, np.int32)
+
+    def labels(self, states: np.ndarray) -> np.ndarray:
+        """int32 [P]: the classes of states [P]; those that were not met before are looked at."""
+        fresh = self._label[states] < 0
+        if fresh.any():
+            self._meet(np.unique(np.asarray(states)[fresh]))
+        return self._label[states]
+
+    def _meet(self, states: np.ndarray) -> None:
+        graph, members = self._maker.graph, self._maker.members(states)
+        sizes = np.diff(members.indptr)
+        weights = np.add.reduceat(graph.num_entries[members.indices], members.indptr[:-1])
+        for index in _chunks(sizes, weights, graph.num_actions):
+            size = int(sizes[index[0]])
+            if is_oversized(size, graph.num_actions):
+                keys = [b"state %d" % state for state in states[index]]
+            else:
+                models = self._maker.make(states[index], size, members[index])
+                forms, _ = canonical_forms(models.transition, _quantum_bits(graph.dtype), models.labels)
+                keys = [hashlib.blake2b(form, digest_size=16).digest() for form in forms]
+            for state, key in zip(states[index].tolist(), keys, strict=True):
+                number = self._class_of_key.setdefault(key, len(self))
+                if number == len(self):
+                    self._representative.append(state)
+                    self._size.append(size)
+                self._label[state] = number
+
+
+def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelClasses:
+    """Groups states whose local models are equal up to a renaming of states that keeps the centre.
+
+    Args:
+      mdp: the model.
+      states: int [P]; all states if None.
+      distance: d >= 1.
+
+    Returns:
+      `LocalModelClasses`. Probabilities count as equal if they agree to about 12 digits (6 in float32), which
+      forgives the rounding of differently ordered sums. A model too large to be compared (`is_oversized`) is a class of
+      its own.
+
+    Raises:
+      ValueError: if a state is out of range or `distance` is below 1.
+    """
+    states = validated_states(mdp, np.arange(mdp.num_states) if states is None else states, distance)
+    book = ClassBook(LocalModelMaker(HostGraph(mdp), distance))
+    label = book.labels(states)
+    _, first = np.unique(label, return_index=True)
+    return LocalModelClasses(label=label, representative=states[first].astype(np.int32), size=book.size)
+
+
+def model_rounding(dtype) -> float:
+    """Largest difference between two probabilities that `local_model_classes` takes as equal."""
+    return 2.0 ** -_quantum_bits(dtype)
+
+
+def isomorphism(one: np.ndarray, other: np.ndarray, labels=None) -> np.ndarray | None:
+    """The renaming that makes two local models equal: state i of `one` is state p[i] of `other`.
+
+    Args:
+      one: [n, A, n], centre first, no padding.
+      other: [m, A, m], likewise.
+      labels: those of both, [n, A, L] and [m, A, L]; or None.
+
+    Returns:
+      int [n], or None where the canonical forms differ. Equal up to `model_rounding`, as within a class.
+    """
+    if one.shape != other.shape:
+        return None
+    stacked = None if labels is None else np.stack(labels)
+    (key, other_key), order = canonical_forms(np.stack([one, other]), _quantum_bits(one.dtype), stacked)
+    if key != other_key:
+        return None
+    renaming = np.empty(len(one), int)
+    renaming[order[0]] = order[1]
+    return renaming
+
+
+def _chunks(sizes: np.ndarray, weights: np.ndarray, num_actions: int) -> Iterator[np.ndarray]:
+    """Numbers of models of one size, as many at a time as memory allows: for their tensors, and for their entries."""
+    for size in np.unique(sizes):
+        (same,) = np.nonzero(sizes == size)
+        most = max(1, _CHUNK_BYTES // (8 * num_actions * int(size) ** 2))
+        batch = np.maximum(np.cumsum(weights[same]) // _CHUNK_ENTRIES, np.arange(len(same)) // most)
+        yield from np.split(same, np.flatnonzero(np.diff(batch)) + 1)
+
+
+def _quantum_bits(dtype) -> int:
+    return 40 if dtype == np.float64 else 20

@@ -1,0 +1,127 @@
+"""How similar two states of a model are: LP (9) between their local models, for many pairs.
+
+LP (9) of Boularias and Chaib-draa 2010 gives every ordered pair of states an error e >= 0: the best a map f from
+M^{s,d} to M^{s',d} can do at commuting with the transitions (`homomorphism_lp` states the program).
+e = 0 means that f is an exact homomorphism.
+
+As printed, the program can be empty of meaning: if the target has a distribution that is stationary under every
+action, an absorbing state say, mapping everything there gives e = 0 whatever the source. `anchored=True` requires
+in addition that the centre is mapped to the centre, which removes that solution; `anchored=False` is the program as
+printed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxhom.models.mdp import MDP
+from jaxhom.similarity.brackets import LocalSimilarity
+from jaxhom.similarity.table import SimilarityTable, table_for
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Int
+
+
+def local_similarity(
+    mdp: MDP,
+    sources: Int[ArrayLike, " P"],
+    targets: Int[ArrayLike, " P"],
+    *,
+    distance: int = 1,
+    anchored: bool = True,
+    tolerance: float = 1e-4,
+    method: str = "auto",
+    max_iterations: int = 100_000,
+    progress: bool = False,
+    table: SimilarityTable | None = None,
+) -> LocalSimilarity:
+    """Brackets the optimal error e of LP (9) for pairs of states, from M^{s,d} to M^{s',d}.
+
+    Args:
+      mdp: the model.
+      sources: int [P], the state s of each pair.
+      targets: int [P], its s'. The error is not symmetric.
+      distance: d >= 1, the radius of the local models.
+      anchored: require that the centre is mapped to the centre; False is the program as printed.
+      tolerance: largest upper - lower to settle for.
+      method: "pdhg"; "interior_point", for tight brackets of small models on a CPU (whatever it leaves open, PDHG
+        finishes); or "auto", which chooses between them by the sizes and the tolerance.
+      max_iterations: per pair, 100,000 if not given; a pair that needs more says so in `status` and keeps valid bounds.
+      progress: show a progress bar.
+      table: what is known already, of the same model, `distance` and `anchored`: asked first, and filled. Made anew if
+        None.
+
+    Returns:
+      `LocalSimilarity`, in the order of the pairs.
+
+    Raises:
+      ValueError: if a state is out of range, the shapes differ, an option is unknown or out of
+        range, or `table` is another's.
+
+    Outside jit, vmap and grad only: local models are found on the host.
+
+    Example:
+      >>> import jaxhom
+      >>> grid = jaxhom.gridworld(8)
+      >>> found = jaxhom.local_similarity(grid, [0, 9], [7, 10])  # two corners; two cells in the middle
+      >>> (found.lower > 0.1).tolist(), (found.upper < 1e-4).tolist()
+      ([True, False], [False, True])
+
+    Source: Boularias and Chaib-draa 2010, eq. (9).
+    """
+    options = {"tolerance": tolerance, "method": method, "max_iterations": max_iterations, "progress": progress}
+    return table_for(table, mdp, distance, anchored).brackets(sources, targets, **options)
+
+
+def locally_similar(
+    mdp: MDP,
+    sources: Int[ArrayLike, " P"],
+    targets: Int[ArrayLike, " P"],
+    threshold: float = 0.0,
+    *,
+    distance: int = 1,
+    anchored: bool = True,
+    mutual: bool = False,
+    tolerance: float = 1e-4,
+    progress: bool = False,
+    table: SimilarityTable | None = None,
+) -> np.ndarray:
+    """Decides e <= threshold for pairs of states, stopping each pair as soon as its bounds settle it.
+
+    A pair counts as similar if e <= threshold is proved up to the tolerance (upper <= threshold + tolerance), and
+    as different if lower > threshold. Where both hold, the upper bound decides: within the band
+    (threshold, threshold + tolerance] either answer is possible. A pair that is not settled after the iteration
+    limit counts as different. Of local models that are equal to about 12 digits (6 in float32) one stands for all.
+
+    Args:
+      mdp: the model.
+      sources: int [P], the state s of each pair.
+      targets: int [P], its s'.
+      threshold: epsilon >= 0.
+      distance: d >= 1, as in `local_similarity`.
+      anchored: as in `local_similarity`.
+      mutual: require the error of both directions to be within the threshold.
+      tolerance: width of the band.
+      progress: show a progress bar.
+      table: as in `local_similarity`.
+
+    Returns:
+      bool [P].
+
+    Raises:
+      ValueError: as `local_similarity`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import jaxhom
+      >>> grid = jaxhom.gridworld(8)
+      >>> jaxhom.locally_similar(grid, [0, 9], [7, 10], threshold=0.1).tolist()
+      [False, True]
+
+    Source: Boularias and Chaib-draa 2010, section V.
+    """
+    options = {"mutual": mutual, "tolerance": tolerance, "progress": progress}
+    return table_for(table, mdp, distance, anchored).decide(sources, targets, threshold, **options)

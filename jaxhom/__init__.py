@@ -14,15 +14,13 @@ interrupts.watch_while_loading()  # before the imports below, which take a secon
 from jaxhom.apprenticeship.lpal import LPALSolution, lpal
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
+from jaxhom.generalization.algorithm1 import soft_local_homomorphism
 from jaxhom.generalization.explanation import Explanation
-from jaxhom.generalization.generalization import (
-    Generalization,
-    maximum_entropy,
-    nearest_neighbors,
-    soft_local_homomorphism,
-)
+from jaxhom.generalization.neighbors import nearest_neighbors
 from jaxhom.generalization.regression import occupancy_regression
+from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
+from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -35,12 +33,10 @@ from jaxhom.planning.occupancy import feature_expectations, occupancy, policy_va
 from jaxhom.planning.optimal import Plan, optimal_policy
 from jaxhom.planning.trials import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
 from jaxhom.similarity.brackets import LocalSimilarity
-from jaxhom.similarity.homomorphism import (
-    homomorphism_error,
-    local_similarity,
-    locally_similar,
-)
-from jaxhom.similarity.homomorphism_map import homomorphism_map
+from jaxhom.similarity.local_pairs import local_similarity, locally_similar
+from jaxhom.similarity.model_errors import homomorphism_error
+from jaxhom.similarity.regularized_map import homomorphism_map
+from jaxhom.similarity.table import SimilarityTable
 from jaxhom.status import Status
 
 __version__ = "0.1.0"
@@ -57,6 +53,7 @@ __all__ = [
     "LocalSimilarity",
     "Plan",
     "Racetrack",
+    "SimilarityTable",
     "Status",
     "agreement",
     "empirical_policy",
@@ -81,4 +78,5 @@ __all__ = [
     "sample_weights",
     "soft_homomorphism",
     "soft_local_homomorphism",
+    "uniform_elsewhere",
 ]

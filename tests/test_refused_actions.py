@@ -4,9 +4,18 @@ import numpy as np
 import oracles
 import pytest
 
-from jaxhom import MDP, Demonstrations, local_similarity, locally_similar, soft_local_homomorphism
+from jaxhom import (
+    MDP,
+    Demonstrations,
+    SimilarityTable,
+    Status,
+    local_similarity,
+    locally_similar,
+    soft_local_homomorphism,
+)
 from jaxhom.models.graph import reachable_within
-from jaxhom.similarity.local_models import local_model_classes, local_models
+from jaxhom.similarity.classes import local_model_classes
+from jaxhom.similarity.local_models import local_models
 
 
 def random_model(rng, num_states=5, num_actions=3):
@@ -78,7 +87,7 @@ def test_many_paths_of_two_steps_are_one_connection():
 
 def test_a_hub_is_left_open_and_costs_nothing(monkeypatch):
     """A state with very many successors is no reason to make everything as large as its local model."""
-    from jaxhom.similarity import homomorphism, local_models
+    from jaxhom.similarity import local_models
 
     monkeypatch.setattr(local_models, "_MAX_ENTRIES", 5000)
     num_states = 90
@@ -90,6 +99,6 @@ def test_a_hub_is_left_open_and_costs_nothing(monkeypatch):
     mdp = MDP.from_successors(next_state, probability, discount=0.9)
     found = local_similarity(mdp, [50, 3, 50], [3, 50, 50])
     assert found.status.tolist() == [1, 1, 0] and (found.upper[:2] == 1).all() and (found.lower[:2] == 0).all()
-    table = homomorphism.ClassSimilarity(mdp, local_model_classes(mdp), 1, True, 1e-4, 0.0)
-    label = table.classes.label
-    assert table.decide(label[[50, 3]], label[[3, 4]]).tolist() == [False, True] and table.num_undecided == 1
+    table = SimilarityTable(mdp)
+    assert table.decide([50, 3], [3, 4]).tolist() == [False, True]
+    assert table.statuses([50, 3], [3, 4]).tolist() == [Status.ITERATION_LIMIT, Status.SOLVED]

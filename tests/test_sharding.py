@@ -8,12 +8,12 @@ PROGRAM = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from jaxhom.similarity.brackets import bracket_errors
+from jaxhom.similarity.brackets import Goal, bracket_errors
 
 assert jax.device_count() == {devices}
 rng = np.random.default_rng(0)
 source, target = (rng.dirichlet(np.ones(3), (700, 3, 2)) for _ in range(2))
-found = bracket_errors(source, target, tolerance=1e-5, method="pdhg")
+found = bracket_errors(source, target, goal=Goal(tolerance=1e-5, method="pdhg"))
 assert (found.upper - found.lower).max() <= 1e-5
 np.save({path!r}, np.stack([found.lower, found.upper]))
 """

@@ -5,7 +5,7 @@ import numpy as np
 from jaxhom.cli.methods import GENERALIZATIONS, check_method, generalize
 from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_method_options, add_model_options
 from jaxhom.cli.sources import Problem, load_problem, load_trajectories
-from jaxhom.generalization.generalization import Generalization
+from jaxhom.generalization.result import Generalization
 
 _EXAMPLES = """\
 examples:

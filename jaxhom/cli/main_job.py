@@ -26,7 +26,9 @@ from jaxhom.cli.results import save_figure
 from jaxhom.cli.tables import GrowingTable
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
-from jaxhom.generalization.generalization import maximum_entropy, nearest_neighbors, soft_local_homomorphism
+from jaxhom.generalization.algorithm1 import soft_local_homomorphism
+from jaxhom.generalization.neighbors import nearest_neighbors
+from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.occupancy import feature_expectations, policy_value
@@ -37,7 +39,7 @@ from jaxhom.status import at_most
 GENERALIZATIONS: dict[str, Callable] = {
     "soft local homomorphism": soft_local_homomorphism,
     "k-NN (hops)": nearest_neighbors,
-    "maximum entropy": maximum_entropy,
+    "maximum entropy": uniform_elsewhere,
 }
 EXPERT = "expert"
 METHODS = (EXPERT, *GENERALIZATIONS, "soft local homomorphism + LPAL")

@@ -4,28 +4,22 @@ import dataclasses
 import sys
 from collections.abc import Callable
 
-from jaxhom.generalization.generalization import (
-    Generalization,
-    class_similarity,
-    maximum_entropy,
-    nearest_neighbors,
-    soft_local_homomorphism,
-)
+from jaxhom.generalization.algorithm1 import soft_local_homomorphism
+from jaxhom.generalization.neighbors import nearest_neighbors
 from jaxhom.generalization.regression import occupancy_regression
+from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
+from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.similarity.table import SimilarityTable
 
 
 def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, **settings):
     if problem.terminal is not None:  # no action matters there, and their local models can be large
         states = ~problem.terminal if states is None else states & ~problem.terminal
-    settings["anchored"] = not printed
-    similarity = class_similarity(problem.mdp, **settings)
-    options = {**settings, "mutual": mutual, "similarity": similarity, "progress": progress}
+    table = SimilarityTable(problem.mdp, distance=settings.get("distance", 1), anchored=not printed)
+    options = {**settings, "anchored": not printed, "mutual": mutual, "table": table, "progress": progress}
     found = soft_local_homomorphism(problem.mdp, demonstrations, states=states, **options)
-    return found, {
-        "classes_of_local_models": len(similarity.classes.representative),
-        "pairs_of_classes_solved": similarity.num_solved,
-    }
+    return found, {"classes_of_local_models": table.num_classes, "pairs_of_classes_solved": table.num_solved}
 
 
 def _global(problem, demonstrations, progress, _, *, printed=False, **settings):
@@ -38,7 +32,7 @@ def _nearest(problem, demonstrations, *_, **settings):
 
 
 def _uniform(problem, demonstrations, *_):
-    return maximum_entropy(problem.mdp, demonstrations), {}
+    return uniform_elsewhere(problem.mdp, demonstrations), {}
 
 
 def _regression(problem, demonstrations, *_):

@@ -15,56 +15,54 @@ from jaxhom.generalization.explanation import Explanation
 from jaxhom.generalization.votes import is_nearest, square_distances
 from jaxhom.models.graph import steps_from
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity.certified_maps import certified_maps
-from jaxhom.similarity.homomorphism import ClassSimilarity
+from jaxhom.similarity.table import Relation, SimilarityTable
 
 LEAST_SHARE = 1e-3  # of the global map, for a demonstrated state to count as a voter
 
 
 class Generalized(Protocol):
-    """What an explainer reads of a generalization: policy [S, A], visited [S] and radius [S]."""
+    """What an explainer reads of a generalization: policy [S, A], visited [S], radius [S] and undecided [S]."""
 
     policy: np.ndarray
     visited: np.ndarray
     radius: np.ndarray
+    undecided: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ByHomomorphism:
-    """Algorithm 1; `asked`, bool [S], are the states that a policy was wanted for, all if None."""
+    """Algorithm 1; `asking`, bool [S], are the states that a policy was looked for in."""
 
     mdp: MDP
-    similarity: ClassSimilarity
-    mutual: bool
-    asked: np.ndarray | None
+    table: SimilarityTable
+    relation: Relation
+    asking: np.ndarray
 
     def __call__(self, general: Generalized, state: int) -> Explanation:
-        if self.asked is not None and not self.asked[state]:
+        if not self.asking[state]:
             return _uniform(general, state, self._method(), "no policy was asked for here (`states` leaves it out)")
         steps = steps_from(self.mdp, state)
         radius = int(general.radius[state])
         if radius < 0:
             why = _met(self.mdp, general, state, steps, ", none locally similar")
-            return _uniform(general, state, self._method(), why)
+            return _uniform(general, state, self._method(), why, _undecided(general, state))
         # Those nearer were refused when their ring was reached, or the search would have ended there.
         candidates = _experts(self.mdp, general, state)
         candidates = candidates[steps[candidates] == radius]
-        label = self.similarity.classes.label
-        similar = self.similarity.decide(np.full(len(candidates), label[state]), label[candidates], mutual=self.mutual)
-        voters = candidates[similar]
-        here, options = np.full(len(voters), state), (self.similarity.distance, self.similarity.anchored)
-        reason = f"{_voted(voters)}, {_steps(radius)} away."
+        relation = self.relation._asdict()
+        voters = candidates[self.table.decide(np.full(len(candidates), state), candidates, **relation)]
+        here = np.full(len(voters), state)
+        reason = f"{_voted(voters)}, {_steps(radius)} away.{_undecided(general, state)}"
         return dataclasses.replace(
             _mean_of(general, state, self._method(), reason, voters, steps[voters], mdp=self.mdp),
-            forward=certified_maps(self.mdp, here, voters, *options),
-            backward=certified_maps(self.mdp, voters, here, *options) if self.mutual else None,
+            forward=self.table.maps(here, voters),
+            backward=self.table.maps(voters, here) if self.relation.mutual else None,
         )
 
     def _method(self) -> str:
-        similarity = self.similarity
-        kind = "anchored" if similarity.anchored else "as printed"
-        both = ", both directions" if self.mutual else ""
-        return f"Algorithm 1 (d = {similarity.distance}, epsilon = {similarity.threshold:g}, {kind}{both})"
+        kind = "anchored" if self.table.anchored else "as printed"
+        both = ", both directions" if self.relation.mutual else ""
+        return f"Algorithm 1 (d = {self.table.distance}, epsilon = {self.relation.threshold:g}, {kind}{both})"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -150,9 +148,9 @@ class ByOccupancy:
         return _mean_of(general, state, "regression", reason)
 
 
-def uniform_elsewhere(general: Generalized, state: int) -> Explanation:
-    """Maximum entropy: nothing is looked for."""
-    return _uniform(general, state, "maximum entropy", "not demonstrated, and this method looks no further")
+def nothing_is_looked_for(general: Generalized, state: int) -> Explanation:
+    """The demonstrations alone: off them the policy is uniform."""
+    return _uniform(general, state, "the demonstrations alone", "not demonstrated, and this method looks no further")
 
 
 def demonstrated(general: Generalized, state: int) -> Explanation:
@@ -191,8 +189,8 @@ def _mean_of(general, state: int, method: str, reason: str, voters=(), distances
     )
 
 
-def _uniform(general, state: int, method: str, why: str) -> Explanation:
-    return _mean_of(general, state, method, f"nothing was found, so the policy is uniform: {why}.")
+def _uniform(general, state: int, method: str, why: str, more: str = "") -> Explanation:
+    return _mean_of(general, state, method, f"nothing was found, so the policy is uniform: {why}.{more}")
 
 
 def _met(mdp: MDP, general, state: int, steps: np.ndarray, qualification: str = "") -> str:
@@ -220,3 +218,9 @@ def _states(count: int) -> str:
 
 def _steps(count: int) -> str:
     return f"{count} step{'s' * (count != 1)}"
+
+
+def _undecided(general, state: int) -> str:
+    """How many demonstrated states had no say because their similarity could not be decided."""
+    count = int(general.undecided[state])
+    return f" The similarity of {_states(count)} could not be decided, which counts as different." if count else ""

@@ -7,8 +7,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxhom.similarity.certified_maps import CertifiedMaps
-from jaxhom.status import Status, bracket
+from jaxhom.similarity.maps import CertifiedMaps
+from jaxhom.status import Record, Status, bracket
 
 _MAX_VOTERS = 12  # of which the text shows a line each
 _MAX_MAPS = 3
@@ -17,8 +17,7 @@ _MAX_TERMS = 4  # of a row
 _LEAST_SHARE = 1e-4  # of a row, to count as more than the solver's tolerance
 
 
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Explanation:
+class Explanation(Record):
     """Which demonstrated states a state's policy came from, how far they are and why they had a say; NumPy.
 
     Attributes:
@@ -37,10 +36,10 @@ class Explanation:
       backward: if similarity had to be mutual, the maps from the voters' models to the state's.
     """
 
-    state: int
-    method: str
-    reason: str
-    radius: int
+    state: int = dataclasses.field(metadata={"static": True})
+    method: str = dataclasses.field(metadata={"static": True})
+    reason: str = dataclasses.field(metadata={"static": True})
+    radius: int = dataclasses.field(metadata={"static": True})
     policy: np.ndarray
     voters: np.ndarray
     weights: np.ndarray

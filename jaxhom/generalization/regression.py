@@ -22,13 +22,14 @@ import scipy.sparse
 from jaxhom import checks
 from jaxhom.generalization import evidence
 from jaxhom.generalization.explainers import ByOccupancy
-from jaxhom.generalization.generalization import Generalization
+from jaxhom.generalization.result import Generalization
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.flow_matrix import flow_matrix
 from jaxhom.solvers.normal_equations import Rows
 from jaxhom.solvers.sparse_interior_point import solve
+from jaxhom.status import Status
 
 _TOLERANCE = 1e-7  # of the objective and of the residuals, as a share of all discounted time
 _GOOD_ENOUGH = 1e-5  # beyond which HiGHS has to do it
@@ -69,6 +70,8 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
         visited=checks.to_device(visited),
         radius=checks.to_device(np.where(visited, 0, found), jnp.int32),
         support=checks.to_device(np.where(visited, 1, decides.sum() * occurs), jnp.int32),
+        undecided=checks.to_device(np.zeros_like(visited), jnp.int32),
+        status=checks.to_device(np.asarray(Status.SOLVED), jnp.int32),
         explainer=ByOccupancy(x, int(decides.sum())),
     )
 

@@ -3,6 +3,8 @@
 LP (8) of Boularias and Chaib-draa 2010, which the paper gave up for its size; `global_lp` states it.
 """
 
+from __future__ import annotations
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +13,16 @@ from tqdm import tqdm
 from jaxhom import checks
 from jaxhom.generalization import evidence
 from jaxhom.generalization.explainers import LEAST_SHARE, ByGlobalMap
-from jaxhom.generalization.generalization import Generalization, maximum_entropy
 from jaxhom.generalization.global_lp import GlobalHomomorphismProblem
+from jaxhom.generalization.result import Generalization
+from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.local_models import restricted_model
 from jaxhom.solvers import pdhg
+from jaxhom.solvers.lane_queue import is_settled
+from jaxhom.status import Status
 
 _ITERATIONS_PER_REPORT = 320
 
@@ -26,7 +31,7 @@ def soft_homomorphism(
     mdp: MDP,
     demonstrations: Demonstrations,
     *,
-    anchored: bool = False,
+    anchored: bool = True,
     tolerance: float = 1e-3,
     max_iterations: int = 20_000,
     progress: bool = False,
@@ -42,7 +47,8 @@ def soft_homomorphism(
       progress: show a progress bar.
 
     Returns:
-      `Generalization` with `error_lower` and `error_upper`. pi(s, .) = sum_s' f(s, s') pi(s', .) off the
+      `Generalization` with `error_lower` and `error_upper`, and a `status` that says why where these are further apart
+      than the tolerance. pi(s, .) = sum_s' f(s, s') pi(s', .) off the
       demonstrated states, over the actions allowed there; their `radius` is 1, and `support` counts the states with
       f(s, s') > 1e-3. Where nothing is left of it, or only absorbing states were demonstrated (there is no map then,
       and the error is infinite), the policy is uniform, with radius -1 and support 0.
@@ -50,19 +56,30 @@ def soft_homomorphism(
     Raises:
       ValueError: if a demonstration does not fit the model, or the tolerance is not positive.
 
+    Outside jit, vmap and grad only: the part of the model that was demonstrated is found on the host.
+
+    Example:
+      >>> import jaxhom
+      >>> demonstrations = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [2, 2, 1])])
+      >>> general = jaxhom.soft_homomorphism(jaxhom.gridworld(3), demonstrations, tolerance=1e-2)
+      >>> jaxhom.Status(int(general.status)).name, bool(general.error_upper - general.error_lower <= 1e-2)
+      ('SOLVED', True)
+
     Source: Boularias and Chaib-draa 2010, eq. (8). The paper gave it up for its size.
     """
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
     mdp = as_model(mdp)
-    start = maximum_entropy(mdp, demonstrations)
+    start = uniform_elsewhere(mdp, demonstrations)
     experts = np.flatnonzero(evidence.deciding(mdp, start.visited))
     if not experts.size:
-        mapping, lower, upper = np.zeros((mdp.num_states, 0)), np.inf, np.inf
+        mapping, lower, upper, status = np.zeros((mdp.num_states, 0)), np.inf, np.inf, Status.SOLVED
     else:
         problem = _problem(mdp, experts, anchored)
         state = _solve_with_progress(problem, tolerance, max_iterations, progress)
         mapping, lower, upper = np.asarray(state.best_primal[..., 0]), state.lower[0], state.upper[0]
+        is_met = is_settled(float(lower), float(upper), tolerance)
+        status = Status.SOLVED if is_met else Status.ITERATION_LIMIT
     policy, is_found = evidence.policy_of_votes(mdp, mapping @ np.asarray(start.policy)[experts])
     visited = start.visited
     return start.replace(
@@ -71,6 +88,7 @@ def soft_homomorphism(
         support=jnp.where(visited, 1, np.where(is_found, (mapping > LEAST_SHARE).sum(axis=1), 0)).astype(jnp.int32),
         error_lower=checks.to_device(lower, mdp.dtype),
         error_upper=checks.to_device(upper, mdp.dtype),
+        status=checks.to_device(np.asarray(status), jnp.int32),
         explainer=ByGlobalMap(mdp, experts, mapping, float(lower), float(upper), anchored),
     )
 

@@ -15,7 +15,7 @@ from jaxhom import checks
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import ACTIONS as RACETRACK_ACTIONS
 from jaxhom.domains.racetrack import Racetrack
-from jaxhom.generalization.generalization import Generalization
+from jaxhom.generalization.result import Generalization
 from jaxhom.plotting.boards import (
     LEVEL_ROOM,
     Board,

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import chex
 import jax
 import numpy as np
 
@@ -24,7 +23,7 @@ from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import certified_bounds
 from jaxhom.solvers import pdhg
 from jaxhom.solvers.lane_queue import is_settled, solve_many
-from jaxhom.status import Status
+from jaxhom.status import Record, Status
 
 METHODS = ("auto", "pdhg", "interior_point")
 
@@ -43,8 +42,7 @@ _TIGHT = 1e-3  # wider gaps PDHG closes sooner
 _MAP_LANES = 8  # maps are asked for a few at a time
 
 
-@chex.dataclass(frozen=True)
-class LocalSimilarity:
+class LocalSimilarity(Record):
     """Certified brackets of the optimal errors of P pairs.
 
     Attributes:
@@ -99,7 +97,7 @@ class Goal(NamedTuple):
 
 
 def choose_method(n: int, m: int, dtype, goal: Goal) -> str:
-    """How LP (9) from n to m states is solved: the interior point for tight brackets of small float64 models on a CPU."""
+    """How LP (9) from n to m states is solved: interior points for tight brackets of small float64 models on a CPU."""
     if goal.method != "auto":
         return goal.method
     is_small = max(n, m) <= MAX_INTERIOR_SIZE and dtype == np.float64 and jax.default_backend() == "cpu"

@@ -10,20 +10,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 
-import chex
 import numpy as np
 
 from jaxhom.models.graph import HostGraph
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.canonical_forms import canonical_forms
 from jaxhom.similarity.local_models import LocalModelMaker, is_oversized, validated_states
+from jaxhom.status import Record
 
 _CHUNK_BYTES = 64 * 2**20
 _CHUNK_ENTRIES = 2**22
 
 
-@chex.dataclass(frozen=True)
-class LocalModelClasses:
+class LocalModelClasses(Record):
     """Classes of isomorphic local models.
 
     Attributes:

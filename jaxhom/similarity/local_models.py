@@ -11,19 +11,18 @@ to keep (`homomorphism_lp`); the rows of such actions are zero.
 
 from __future__ import annotations
 
-import chex
 import numpy as np
 import scipy.sparse
 
 from jaxhom import checks
 from jaxhom.models.graph import HostGraph
 from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
 
 _MAX_ENTRIES = 2**24  # of a transition tensor: 128 MB in float64
 
 
-@chex.dataclass(frozen=True)
-class LocalModels:
+class LocalModels(Record):
     """P local models padded to the size n of the largest.
 
     Attributes:

@@ -6,16 +6,15 @@ states, by the renaming that makes each equal to the one that stands for its cla
 
 from __future__ import annotations
 
-import chex
 import numpy as np
 
 from jaxhom.similarity.brackets import LocalSimilarity
 from jaxhom.similarity.classes import isomorphism
 from jaxhom.similarity.local_models import LocalModelMaker, is_oversized
+from jaxhom.status import Record
 
 
-@chex.dataclass(frozen=True)
-class CertifiedMaps:
+class CertifiedMaps(Record):
     """Maps from the local models of P source states to those of P target states, NumPy.
 
     Attributes:

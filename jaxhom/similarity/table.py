@@ -6,7 +6,7 @@ same table, and bounds that were found for one threshold serve every other.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -16,18 +16,26 @@ from jaxhom.models.graph import HostGraph
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
-from jaxhom.similarity.maps import CertifiedMaps, carry_maps
 from jaxhom.similarity.class_pairs import ClassPairs
 from jaxhom.similarity.classes import ClassBook
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
+from jaxhom.similarity.maps import CertifiedMaps, carry_maps
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys
 from jaxhom.solvers.lane_queue import is_settled
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
-    from jaxtyping import ArrayLike, Bool, Int
+    from jaxtyping import ArrayLike, Int
 
 _MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}
+
+
+class Relation(NamedTuple):
+    """When one state counts as similar to another; the fields are arguments of `SimilarityTable.decide`."""
+
+    threshold: float = 0.0
+    mutual: bool = False
+    tolerance: float = 1e-4
 
 
 class SimilarityTable:
@@ -135,7 +143,7 @@ class SimilarityTable:
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
         return self._decide(pairs, goal, mutual, progress)[where]
 
-    def undecided(
+    def statuses(
         self,
         sources: Int[ArrayLike, " P"],
         targets: Int[ArrayLike, " P"],
@@ -144,22 +152,20 @@ class SimilarityTable:
         mutual: bool = False,
         tolerance: float = 1e-4,
     ) -> np.ndarray:
-        """bool [P]: the pairs that `decide` has called different because its bounds stayed too far apart to tell.
+        """int32 [P]: a `jaxhom.Status`, SOLVED where the bounds so far decide e <= threshold, or else why they do not.
 
-        Solves nothing; arguments as in `decide`, which has to have been asked before.
+        What is not decided counts as different. Solves nothing; arguments as in `decide`.
         """
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
-        is_open = ~self._is_similar(pairs, goal) & ~self._is_far(pairs, goal)
+        status = self._decision_status(pairs, goal)
         if mutual:  # one direction that is too far decides the pair
             back = pairs[:, ::-1]
-            is_open |= ~self._is_similar(back, goal) & ~self._is_far(back, goal)
-            is_open &= ~self._is_far(pairs, goal) & ~self._is_far(back, goal)
-        return is_open[where]
+            is_far = self._is_far(pairs, goal) | self._is_far(back, goal)
+            status = np.where(is_far, Status.SOLVED, np.maximum(status, self._decision_status(back, goal)))
+        return status.astype(np.int32)[where]
 
-    def complete(
-        self, threshold: float = 0.0, *, tolerance: float = 1e-4, progress: bool = False
-    ) -> SimilarityTable:
+    def complete(self, threshold: float = 0.0, *, tolerance: float = 1e-4, progress: bool = False) -> SimilarityTable:
         """Decides e <= threshold for all ordered pairs of classes of the model, and returns the table."""
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         self.classes()
@@ -230,6 +236,9 @@ class SimilarityTable:
 
     def _is_far(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
         return (self._known.look_up(pairs).lower > goal.threshold) & ~self._is_similar(pairs, goal)
+
+    def _decision_status(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
+        return _status(self._is_similar(pairs, goal) | self._is_far(pairs, goal), self._known.look_up(pairs).status)
 
     def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""

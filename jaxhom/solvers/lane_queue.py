@@ -1,8 +1,9 @@
 """Many problems through a fixed number of lanes: finished lanes leave, waiting problems take their place.
 
-A *lane* is one problem of a batch: one index of the last axis of every array. Under one `while_loop` a batch runs until its slowest lane stops. Here the loop ends when a quarter of the lanes are
-done, and the host takes their answers out and fills them from the queue. The batch keeps one width, so one program is
-compiled; a narrow batch (64 lanes fill the vector units of a CPU) wastes little on the last, slow lanes.
+A *lane* is one problem of a batch: one index of the last axis of every array. Under one `while_loop` a batch runs until
+its slowest lane stops. Here the loop ends when a quarter of the lanes are done, and the host takes their answers out
+and fills them from the queue. The batch keeps one width, so one program is compiled; a narrow batch (64 lanes fill the
+vector units of a CPU) wastes little on the last, slow lanes.
 
 On a CPU that JAX sees as one device, a batch per core is under way at a time, each driven by a thread: XLA runs the
 small programs of one batch on one core. With several devices each gets its own share of the lanes: the lane axis of

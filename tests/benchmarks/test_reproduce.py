@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from interrupt_often import watching
+from jaxhom.similarity.homomorphism import ClassSimilarity
 
 from bench import comparison, problems, report, reproduce, settings, summaries, sweep, tables
 from bench.intervals import mean_interval
@@ -20,7 +21,6 @@ from bench.methods import FIGURE1, TABLE1, Decisions, Learned, manhattan_knn, mo
 from bench.rows import Row, RowFile, read_rows
 from bench.settings import Setting
 from jaxhom import Demonstrations, LocalSimilarity, empirical_policy
-from jaxhom.similarity.homomorphism import ClassSimilarity
 from jaxhom.similarity.local_models import local_model_classes
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent.parent

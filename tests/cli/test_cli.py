@@ -14,7 +14,7 @@ from jaxhom import interop
 from jaxhom.apprenticeship.lpal import LPALSolution
 from jaxhom.cli import main_job
 from jaxhom.cli.parser import main, make_parser
-from jaxhom.generalization.generalization import maximum_entropy
+from jaxhom.generalization.uniform import uniform_elsewhere
 
 SMALL = ["--grid", "2", "--regions", "1", "--demonstrations", "1", "--sets", "1"]
 
@@ -54,8 +54,11 @@ def quick_methods(monkeypatch):
 
     monkeypatch.setattr(main_job, "lpal", lpal)
     monkeypatch.setattr(main_job, "feature_expectations", lambda mdp, policies: None)
-    monkeypatch.setattr(main_job, "soft_local_homomorphism", maximum_entropy)
-    methods = {"soft local homomorphism": maximum_entropy, "k-NN (hops)": lambda *problem: maximum_entropy(*problem)}
+    monkeypatch.setattr(main_job, "soft_local_homomorphism", uniform_elsewhere)
+    methods = {
+        "soft local homomorphism": uniform_elsewhere,
+        "k-NN (hops)": lambda *problem: uniform_elsewhere(*problem),
+    }
     monkeypatch.setattr(main_job, "GENERALIZATIONS", methods)
 
 

@@ -16,7 +16,7 @@ import jaxhom
 from jaxhom.cli import learn, methods, results, sources
 from jaxhom.cli.options import environment_options
 from jaxhom.cli.parser import main
-from jaxhom.generalization.generalization import maximum_entropy
+from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.interop import load_demonstrations
 
 INNER = np.setdiff1d(np.arange(STATES), [5, 7, 11, 12, 15])  # in the others episodes end
@@ -90,7 +90,7 @@ def test_options_reach_their_method(files, monkeypatch, options):
 
 def test_the_global_map_reports_its_bounds(files, monkeypatch, capsys):
     def bounded(mdp, demonstrations, **_):
-        return maximum_entropy(mdp, demonstrations).replace(error_lower=0.25, error_upper=0.5)
+        return uniform_elsewhere(mdp, demonstrations).replace(error_lower=0.25, error_upper=0.5)
 
     monkeypatch.setattr(methods, "soft_homomorphism", bounded)
     assert main(["learn", *files.options(), "--method", "soft-homomorphism", "--no-pictures"]) == 0

@@ -34,7 +34,7 @@ def methods(width):
         "euclidean": with_coordinates(functools.partial(jaxhom.nearest_neighbors, metric="euclidean"), width),
         "regression": with_coordinates(jaxhom.occupancy_regression, width),
         "global": functools.partial(jaxhom.soft_homomorphism, max_iterations=40),
-        "maximum entropy": jaxhom.maximum_entropy,
+        "maximum entropy": jaxhom.uniform_elsewhere,
     }
 
 
@@ -191,7 +191,7 @@ def test_the_regression_has_no_variable_for_what_does_not_exist():
 def test_what_has_a_model_will_do_for_one():
     world = jaxhom.gridworld(4)
     demonstrations = Demonstrations.from_trajectories([([5], [1])])
-    for use in (jaxhom.nearest_neighbors, jaxhom.maximum_entropy):
+    for use in (jaxhom.nearest_neighbors, jaxhom.uniform_elsewhere):
         chex.assert_trees_all_equal(use(world, demonstrations), use(world.mdp, demonstrations))
     np.testing.assert_array_equal(
         jaxhom.empirical_policy(world, demonstrations)[1][5], jnp.eye(4, dtype=world.mdp.dtype)[1]

@@ -10,8 +10,7 @@ import oracles
 import pytest
 
 import jaxhom
-from jaxhom import MDP, Demonstrations
-from jaxhom.similarity.certified_maps import certified_maps
+from jaxhom import MDP, Demonstrations, SimilarityTable
 
 
 class World(NamedTuple):
@@ -137,7 +136,7 @@ def test_algorithm_1_explains_its_votes():
 def test_maps_of_the_program_as_printed():
     """Every state of the strip can be sent to its closed end at no error."""
     here, sources, targets = world("strip"), [0, 3, 9, 3], [7, 15, 15, 3]
-    found = certified_maps(here.mdp, sources, targets, 1, False)
+    found = SimilarityTable(here.mdp, anchored=False).maps(sources, targets)
     assert_certified(found, "strip", sources, targets, 1, False)
     assert found.upper.max() <= 1e-6
 
@@ -146,7 +145,7 @@ def test_a_map_can_merge_states_but_not_split_them():
     """0 chooses between 2 and 3, 1 has only 4: both of them can be 4, but 4 cannot be both."""
     successors = np.array([[2, 3, 2, 3], [4] * 4, [1] * 4, [1] * 4, [0] * 4])
     mdp = MDP.from_dense(np.eye(5)[successors], discount=0.9)
-    found = certified_maps(mdp, [0, 1], [1, 0], 1, True)
+    found = SimilarityTable(mdp).maps([0, 1], [1, 0])
     assert (found.sources.tolist(), found.targets.tolist()) == ([[0, 2, 3], [1, 4, -1]], [[1, 4, -1], [0, 2, 3]])
     np.testing.assert_allclose(found.maps[0], [[1, 0, 0], [0, 1, 0], [0, 1, 0]], atol=1e-5)
     assert found.upper[0] <= 1e-6
@@ -217,7 +216,7 @@ def test_the_global_map_explains_by_its_row():
 @pytest.mark.parametrize(
     ("method", "text"),
     [
-        (jaxhom.maximum_entropy, "nothing was found, so the policy is uniform: not demonstrated"),
+        (jaxhom.uniform_elsewhere, "nothing was found, so the policy is uniform: not demonstrated"),
         (lambda mdp, demos: jaxhom.occupancy_regression(mdp, demos, world("grid").coordinates), "no state voted"),
     ],
     ids=["maximum entropy", "regression"],
@@ -261,6 +260,6 @@ def test_a_generalization_is_a_pytree_of_arrays_and_can_be_pickled():
 )
 def test_states_that_do_not_exist_are_refused(state, message):
     here = world("grid")
-    general = jaxhom.maximum_entropy(here.mdp, here.demonstrations)
+    general = jaxhom.uniform_elsewhere(here.mdp, here.demonstrations)
     with pytest.raises(ValueError, match=message):
         general.explain(state)

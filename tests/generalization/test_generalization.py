@@ -12,14 +12,17 @@ import pytest
 from jaxhom import (
     MDP,
     Demonstrations,
+    SimilarityTable,
+    Status,
     gridworld,
     maximum_entropy,
     nearest_neighbors,
     racetrack,
     soft_homomorphism,
     soft_local_homomorphism,
+    uniform_elsewhere,
 )
-from jaxhom.generalization.generalization import class_similarity
+from jaxhom.similarity import class_pairs
 
 TRACK = ["S..F", "S..F"]
 
@@ -158,16 +161,41 @@ def test_float32_gives_the_same_policy():
 
 def test_one_table_of_decisions_serves_many_demonstrations():
     here = world("grid")
-    shared = class_similarity(here.mdp, threshold=0.3)
-    first = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3, similarity=shared)
+    shared = SimilarityTable(here.mdp)
+    first = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3, table=shared)
     solved = shared.num_solved
     assert solved > 0
-    again = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3, similarity=shared)
+    with pytest.warns(DeprecationWarning, match="similarity is now called table"):
+        again = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3, similarity=shared)
     assert shared.num_solved == solved
     alone = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3)
     chex.assert_trees_all_equal(first, again, alone)
-    with pytest.raises(ValueError, match="similarity was made with another"):
-        soft_local_homomorphism(here.mdp, here.demonstrations, similarity=shared)
+    stricter = soft_local_homomorphism(here.mdp, here.demonstrations, table=shared)
+    chex.assert_trees_all_equal(stricter, soft_local_homomorphism(here.mdp, here.demonstrations))
+    with pytest.raises(ValueError, match="table was made with distance=1 and anchored=True, not with distance=2"):
+        soft_local_homomorphism(here.mdp, here.demonstrations, distance=2, table=shared)
+
+
+def test_the_former_name_of_uniform_elsewhere_warns():
+    here = world("grid")
+    with pytest.warns(DeprecationWarning, match="maximum_entropy is now called uniform_elsewhere"):
+        former = maximum_entropy(here.mdp, here.demonstrations)
+    chex.assert_trees_all_equal(former, uniform_elsewhere(here.mdp, here.demonstrations))
+
+
+def test_what_could_not_be_decided_is_said(monkeypatch):
+    """With no iterations to speak of, pairs stay open: they count as different, and the result and its text say so."""
+    here = world("grid")
+    monkeypatch.setattr(class_pairs, "_MAX_PRODUCTS", 0.0)
+    monkeypatch.setattr(class_pairs, "_MIN_ITERATIONS", 1)
+    result = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3)
+    undecided, visited = np.asarray(result.undecided), np.asarray(result.visited)
+    assert undecided.sum() > 0 and not undecided[visited].any()
+    assert Status(int(result.status)) == Status.ITERATION_LIMIT
+    text = str(result.explain(int(np.argmax(undecided))))
+    assert "could not be decided, which counts as different" in text
+    decided = soft_local_homomorphism(here.mdp, here.demonstrations)
+    assert not np.asarray(decided.undecided).any() and int(decided.status) == Status.SOLVED
 
 
 def test_only_the_states_that_ask_are_answered():
@@ -228,9 +256,9 @@ def test_euclidean_in_three_dimensions():
 
 
 @pytest.mark.parametrize("name", ["grid", "track"])
-def test_maximum_entropy(name):
+def test_uniform_elsewhere(name):
     here = world(name)
-    result = maximum_entropy(here.mdp, here.demonstrations)
+    result = uniform_elsewhere(here.mdp, here.demonstrations)
     visited, policy = oracles.empirical_policy(*here.transition.shape[:2], here.trajectories)
     assert_extends(result, here, policy, np.where(visited, 0, -1))
     np.testing.assert_array_equal(result.policy[~visited], 1 / here.mdp.num_actions)
@@ -239,7 +267,7 @@ def test_maximum_entropy(name):
 def test_the_global_map():
     """LP (8): the error against HiGHS, between a model and its part that was demonstrated."""
     here = world("strip")
-    result = soft_homomorphism(here.mdp, here.demonstrations, tolerance=2e-3)
+    result = soft_homomorphism(here.mdp, here.demonstrations, anchored=False, tolerance=2e-3)
     visited, empirical = oracles.empirical_policy(16, 4, here.trajectories)
     error, _ = oracles.global_homomorphism_lp(here.transition, visited)
     assert result.error_lower <= error + 1e-9 and result.error_upper >= error - 1e-9
@@ -258,7 +286,7 @@ def test_the_global_error_on_a_6x6_grid(rng):
     transition = oracles.gridworld_transition(6)
     trajectories = [(np.array([0, 1, 7, 8]), rng.integers(4, size=4)), (np.array([35, 34]), rng.integers(4, size=2))]
     mdp = MDP.from_dense(transition, discount=0.9)
-    result = soft_homomorphism(mdp, Demonstrations.from_trajectories(trajectories), tolerance=1e-3)
+    result = soft_homomorphism(mdp, Demonstrations.from_trajectories(trajectories), anchored=False, tolerance=1e-3)
     visited = np.isin(np.arange(36), [0, 1, 7, 8, 34, 35])
     error, _ = oracles.global_homomorphism_lp(transition, visited)
     assert result.error_lower - 1e-9 <= error <= result.error_upper + 1e-9
@@ -273,7 +301,7 @@ METHODS = {
     "euclidean": lambda mdp, demonstrations: nearest_neighbors(
         mdp, demonstrations, metric="euclidean", coordinates=np.arange(mdp.num_states)[:, None]
     ),
-    "maximum entropy": maximum_entropy,
+    "maximum entropy": uniform_elsewhere,
     "global": soft_homomorphism,
 }
 

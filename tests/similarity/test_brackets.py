@@ -5,7 +5,7 @@ import oracles
 import pytest
 
 from jaxhom import Status
-from jaxhom.similarity.brackets import METHODS, bracket_errors, lower_bounds_without_iterations
+from jaxhom.similarity.brackets import METHODS, Goal, bracket_errors, lower_bounds_without_iterations
 from jaxhom.solvers import lane_queue
 
 PAIRS = 24
@@ -32,7 +32,7 @@ def assert_holds(found, optimum, tolerance=1e-4):
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
 def test_brackets_hold_the_optimum(method, tolerance, anchored):
     source, target = models(0, 4, 3)
-    found = bracket_errors(source, target, method=method, tolerance=tolerance, anchored=anchored)
+    found = bracket_errors(source, target, anchored=anchored, goal=Goal(method=method, tolerance=tolerance))
     optimum = errors(source, target, anchored)
     assert (found.upper - found.lower <= tolerance).all() and (found.status == 0).all()
     assert (found.lower <= optimum + 1e-9).all() and (optimum <= found.upper + 1e-9).all()
@@ -44,7 +44,7 @@ def test_padding_changes_nothing(method):
     size = np.full(PAIRS, 4), np.full(PAIRS, 3)
     wide = np.zeros((PAIRS, 6, 2, 6)), np.zeros((PAIRS, 5, 2, 5))
     wide[0][:, :4, :, :4], wide[1][:, :3, :, :3] = source, target
-    found = bracket_errors(*wide, source_size=size[0], target_size=size[1], method=method, tolerance=1e-6)
+    found = bracket_errors(*wide, source_size=size[0], target_size=size[1], goal=Goal(method=method, tolerance=1e-6))
     optimum = errors(source, target)
     assert (found.lower <= optimum + 1e-9).all() and (optimum <= found.upper + 1e-9).all()
 
@@ -52,7 +52,7 @@ def test_padding_changes_nothing(method):
 def test_interior_point_is_finished_by_pdhg_where_it_stalls():
     """Tolerances at the edge of rounding: no lane may be left open without saying so."""
     source, target = models(2, 4, 3)
-    found = bracket_errors(source, target, method="interior_point", tolerance=1e-9, max_iterations=2000)
+    found = bracket_errors(source, target, goal=Goal(method="interior_point", tolerance=1e-9, max_iterations=2000))
     gap = found.upper - found.lower
     optimum = errors(source, target)
     assert ((gap <= 1e-9) == (found.status == 0)).all()
@@ -72,7 +72,7 @@ def test_decisions(method):
     source, target = models(4, 4, 3, concentration=0.3)
     optimum = errors(source, target)
     for threshold in np.quantile(optimum, [0.2, 0.6]) + 1e-3:
-        found = bracket_errors(source, target, threshold=threshold, method=method)
+        found = bracket_errors(source, target, goal=Goal(threshold=threshold, method=method))
         np.testing.assert_array_equal(found.upper <= threshold + 1e-4, optimum <= threshold)
         assert (found.lower <= optimum + 1e-9).all() and (optimum <= found.upper + 1e-9).all()
         assert (found.iterations == 0).any()
@@ -85,7 +85,7 @@ def test_no_pairs():
 
 def test_one_state_models():
     ones = np.ones((2, 1, 2, 1))
-    found = bracket_errors(ones, ones, threshold=0.0)
+    found = bracket_errors(ones, ones, goal=Goal(threshold=0.0))
     assert (found.upper <= 1e-4).all()
 
 
@@ -93,7 +93,7 @@ def test_one_state_models():
 def test_one_state_source(method):
     """Anchored, nothing is free: the error is what the two centres differ by."""
     source, target = models(5, 1, 3)
-    found = bracket_errors(source, target, method=method)
+    found = bracket_errors(source, target, goal=Goal(method=method))
     by_hand = np.maximum(1 - target[:, 0, :, 0], target[:, 0, :, 1:].max(axis=-1)).max(axis=1)
     assert_holds(found, by_hand)
 
@@ -122,13 +122,13 @@ def test_labels(method, dtype, anchored):
     source, target, labels = labelled(6, dtype)
     optimum = errors(source, target, anchored, labels.values())
     assert (optimum > errors(source, target, anchored) + 0.05).any()
-    assert_holds(bracket_errors(source, target, method=method, anchored=anchored, **labels), optimum)
+    assert_holds(bracket_errors(source, target, anchored=anchored, **labels, goal=Goal(method=method)), optimum)
 
 
 def test_rows_that_lead_nowhere():
     source, target, _ = labelled(7)
     for anchored in (True, False):
-        found = bracket_errors(source, target, anchored=anchored, method="pdhg")
+        found = bracket_errors(source, target, anchored=anchored, goal=Goal(method="pdhg"))
         assert_holds(found, errors(source, target, anchored))
 
 
@@ -139,7 +139,7 @@ def test_labels_that_say_nothing():
         "source_labels": np.full((*source.shape[:3], 2), 3.0),
         "target_labels": np.full((*target.shape[:3], 2), 3.0),
     }
-    assert_holds(bracket_errors(source, target, method="interior_point", **labels), errors(source, target))
+    assert_holds(bracket_errors(source, target, **labels, goal=Goal(method="interior_point")), errors(source, target))
 
 
 def test_labels_of_a_renamed_copy():
@@ -147,7 +147,7 @@ def test_labels_of_a_renamed_copy():
     source, _, labels = labelled(8)
     order = [0, 2, 3, 1]
     target = source[:, order][..., order]
-    options = {"source_labels": labels["source_labels"], "method": "interior_point"}
+    options = {"source_labels": labels["source_labels"], "goal": Goal(method="interior_point")}
     copied = bracket_errors(source, target, target_labels=labels["source_labels"][:, order], **options)
     assert (copied.upper <= 1e-4).all()
     other = bracket_errors(source, target, target_labels=1 - labels["source_labels"][:, order], **options)
@@ -162,7 +162,7 @@ def test_bounds_without_iterations_with_labels():
         bound >= np.abs(labels["source_labels"][:, 0] - labels["target_labels"][:, 0]).max(axis=(1, 2)) - 1e-12
     ).all()
     large = {name: 5.0 * label for name, label in labels.items()}
-    found = bracket_errors(source, target, threshold=0.01, **large)
+    found = bracket_errors(source, target, **large, goal=Goal(threshold=0.01))
     optimum = errors(source, target, labels=large.values())
     assert (found.lower <= optimum + 1e-9).all() and (optimum <= found.upper + 1e-9).all() and (optimum > 1).any()
 
@@ -199,7 +199,7 @@ def test_exact_lumpings_of_many_states_in_float32():
     moved = lumped.copy()
     moved[0, 0, 0] = [0.2, 0.3, 0.5]
     source, target = np.repeat(model, 2, axis=0), np.concatenate([lumped, moved])
-    found = bracket_errors(source, target, threshold=0.0)
+    found = bracket_errors(source, target, goal=Goal(threshold=0.0))
     np.testing.assert_array_equal(found.status, Status.SOLVED)
     assert found.upper[0] <= 1e-4 and found.lower[1] > 1e-4
 
@@ -209,9 +209,9 @@ def test_the_same_answer_to_the_last_bit(monkeypatch):
     monkeypatch.setattr(lane_queue, "num_cores", lambda: 2)
     rng = np.random.default_rng(12)
     source, target = (rng.dirichlet(np.ones(3), (400, 3, 2)) for _ in "ab")
-    first, again = (bracket_errors(source, target, method="pdhg", tolerance=1e-5) for _ in "ab")
+    first, again = (bracket_errors(source, target, goal=Goal(method="pdhg", tolerance=1e-5)) for _ in "ab")
     order = rng.permutation(400)
-    reordered = bracket_errors(source[order], target[order], method="pdhg", tolerance=1e-5)
+    reordered = bracket_errors(source[order], target[order], goal=Goal(method="pdhg", tolerance=1e-5))
     for field in ("lower", "upper", "iterations", "status"):
         np.testing.assert_array_equal(first[field], again[field])
         np.testing.assert_array_equal(first[field][order], reordered[field])
@@ -222,8 +222,8 @@ def test_a_pair_that_is_not_a_number_ends_and_spoils_no_other(method):
     source, target = models(0, 4, 3)
     broken = source.copy()
     broken[3, 0, 0, 0] = np.nan
-    found = bracket_errors(broken, target, method=method)
+    found = bracket_errors(broken, target, goal=Goal(method=method))
     others = np.arange(PAIRS) != 3
     assert found.status[3] != Status.SOLVED and (found.status[others] == Status.SOLVED).all()
-    whole = bracket_errors(source, target, method=method)
+    whole = bracket_errors(source, target, goal=Goal(method=method))
     np.testing.assert_array_equal(found.upper[others], whole.upper[others])

@@ -12,7 +12,7 @@ import pytest
 from jaxhom import homomorphism_map
 from jaxhom.similarity.homomorphism_lp import plain_forward
 
-homomorphism_map_module = sys.modules["jaxhom.similarity.homomorphism_map"]
+homomorphism_map_module = sys.modules["jaxhom.similarity.regularized_map"]
 
 
 def pair(seed, n=3, m=2, num_actions=2):

@@ -13,13 +13,10 @@ from jaxhom.domains.gridworld import gridworld
 from jaxhom.domains.racetrack import racetrack
 from jaxhom.models.graph import reachable_within
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity import local_models as local_models_module
+from jaxhom.similarity import classes as classes_module
 from jaxhom.similarity.canonical_forms import canonical_forms
-from jaxhom.similarity.local_models import (
-    local_model_classes,
-    local_models,
-    model_rounding,
-)
+from jaxhom.similarity.classes import local_model_classes, model_rounding
+from jaxhom.similarity.local_models import local_models
 
 MODELS = {
     "grid": lambda: oracles.gridworld_transition(5),
@@ -296,7 +293,7 @@ def test_classes_do_not_depend_on_the_chunks(models_per_chunk, monkeypatch):
         transition[8 * i : 8 * i + 8, :, 8 * i : 8 * i + 8] = chain if i % 5 == 3 else block
     expected = local_model_classes(as_mdp(transition), distance=7).label
     assert np.unique(expected[0::8]).size == 2
-    monkeypatch.setattr(local_models_module, "_CHUNK_BYTES", models_per_chunk * 8 * 8**2)
+    monkeypatch.setattr(classes_module, "_CHUNK_BYTES", models_per_chunk * 8 * 8**2)
     label = local_model_classes(as_mdp(transition), distance=7).label
     np.testing.assert_array_equal(label, expected)
 

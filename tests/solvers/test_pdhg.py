@@ -15,7 +15,7 @@ from jaxhom.similarity import interior_point
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem, plain_adjoint, plain_forward
 from jaxhom.solvers import pdhg, projections
 from jaxhom.solvers.game_pdhg import MatrixGame
-from jaxhom.solvers.lane_queue import solve_many
+from jaxhom.solvers.lane_queue import is_settled, solve_many
 from jaxhom.solvers.pdhg import SOLVER, PDHGState
 from jaxhom.solvers.projections import project_l1_ball, project_simplex, reduce_leading
 from jaxhom.status import Status

@@ -1,4 +1,4 @@
-"""Errors of LP (9), decisions about them and their derivatives, against HiGHS.
+"""Errors of LP (9) between states of a model and decisions about them, against HiGHS.
 
 Most models here have four actions and a local model of six states, and most calls meet one of those: each
 size of the largest model in a call is a program to compile.
@@ -13,12 +13,11 @@ import numpy as np
 import oracles
 import pytest
 
-from jaxhom import Status, homomorphism_error, local_similarity, locally_similar
+from jaxhom import SimilarityTable, Status, local_similarity, locally_similar
 from jaxhom.domains.gridworld import gridworld
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity import homomorphism as homomorphism_module
-from jaxhom.similarity.local_models import local_model_classes, model_rounding
-from jaxhom.solvers import pdhg
+from jaxhom.similarity import class_pairs
+from jaxhom.similarity.classes import local_model_classes, model_rounding
 
 
 def block_diagonal(blocks):
@@ -230,9 +229,8 @@ def test_repeated_pairs_share_one_answer():
     once = local_similarity(mdp, sources, targets)
     order = np.resize(np.random.default_rng(0).permutation(20), 50)
     again = local_similarity(mdp, sources[order].tolist(), targets[order].tolist())
-    for field in ("lower", "upper"):
-        np.testing.assert_allclose(again[field], once[field][order], rtol=0, atol=1e-4)
-        np.testing.assert_array_equal(again[field][:20], np.resize(again[field], 40)[20:])
+    for one, other in ((again.lower, once.lower), (again.upper, once.upper)):
+        np.testing.assert_allclose(one, other[order], rtol=0, atol=1e-4)
     chex.assert_trees_all_equal(
         jax.tree.map(lambda leaf: leaf[20:40], again), jax.tree.map(lambda leaf: leaf[:20], again)
     )
@@ -266,14 +264,14 @@ def test_chunks_of_pairs(monkeypatch):
     pairs = random_pairs("blocks", 12)
     whole = local_similarity(mdp, *pairs, method="pdhg")
     calls = []
-    bracket_errors = homomorphism_module.bracket_errors
+    bracket_errors = class_pairs.bracket_errors
 
     def recorded(source, target, **options):
         calls.append(len(source))
         return bracket_errors(source, target, **options)
 
-    monkeypatch.setattr(homomorphism_module, "_CHUNK_BYTES", 5000)
-    monkeypatch.setattr(homomorphism_module, "bracket_errors", recorded)
+    monkeypatch.setattr(class_pairs, "_CHUNK_BYTES", 5000)
+    monkeypatch.setattr(class_pairs, "bracket_errors", recorded)
     parts = local_similarity(mdp, *pairs, method="pdhg")
     assert len(calls) > 1 and sum(calls) == (whole.iterations > 0).sum()
     np.testing.assert_allclose(parts.lower, whole.lower, rtol=0, atol=1e-4)
@@ -284,12 +282,12 @@ def test_progress_counts_all_pairs(capsys, monkeypatch):
     mdp, _ = model_of("blocks")
     bars = []
 
-    class Recorded(homomorphism_module.tqdm):
+    class Recorded(class_pairs.tqdm):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
             bars.append(self)
 
-    monkeypatch.setattr(homomorphism_module, "tqdm", Recorded)
+    monkeypatch.setattr(class_pairs, "tqdm", Recorded)
     local_similarity(mdp, [40, 6, 7], [41, 6, 20], progress=True)
     assert [(bar.n, bar.total) for bar in bars] == [(3, 3)]
     assert "0/3" in capsys.readouterr().err
@@ -346,29 +344,13 @@ def test_exact_lumpings_of_many_states_are_similar_in_float32():
 def test_decisions_stop_early():
     """A threshold far from the error is decided in a fraction of the iterations."""
     mdp, _ = model_of("blocks")
-    classes = local_model_classes(mdp)
-    pairs = np.stack(random_pairs("blocks", 60), axis=1)
-    pairs = pairs[classes.label[pairs[:, 0]] != classes.label[pairs[:, 1]]]
-    labels = np.unique(classes.label[pairs], axis=0)
-    steps = []
-    for threshold in (None, 0.9):
-        options = {"tolerance": 1e-5, "threshold": threshold, "method": "pdhg"}
-        solver = homomorphism_module.ClassSimilarity(mdp, classes, 1, True, **options)
-        steps.append(solver.solve(labels).iterations.mean())
-        assert solver.num_solved == len(labels)
-    assert steps[1] < 0.5 * steps[0]
-
-
-def test_a_pair_of_classes_is_decided_once():
-    mdp, _ = model_of("blocks")
-    classes = local_model_classes(mdp)
-    solver = homomorphism_module.ClassSimilarity(mdp, classes, 1, True, 1e-3, 0.1)
-    sources, targets = classes.label[np.array(random_pairs("blocks", 30))]
-    first = solver.decide(sources, targets, mutual=True)
-    solved = solver.num_solved
-    assert 0 < solved <= 60
-    np.testing.assert_array_equal(solver.decide(targets, sources, mutual=True), first)
-    assert solver.num_solved == solved
+    pairs = random_pairs("blocks", 60)
+    open_, decided = SimilarityTable(mdp), SimilarityTable(mdp)
+    steps = open_.brackets(*pairs, tolerance=1e-5, method="pdhg").iterations.mean()
+    decided.decide(*pairs, 0.9, tolerance=1e-5)
+    # Read without solving: the bounds of the decisions are within a gap of 2.
+    assert decided.brackets(*pairs, tolerance=2.0).iterations.mean() < 0.5 * steps
+    assert decided.num_solved == open_.num_solved
 
 
 # ------------------------------------------------------------------------------ what is refused
@@ -411,200 +393,3 @@ def test_traced_input_is_refused():
         jax.jit(lambda mdp: local_similarity(mdp, [0], [1]))(mdp)
     with pytest.raises(ValueError, match="sources is a traced value"):
         jax.jit(lambda s: locally_similar(mdp, s, [1]))(jnp.array([0]))
-
-
-# --------------------------------------------------------------------- as a differentiable function
-
-
-@functools.cache
-def small_pairs():
-    """Models of three and of four states, [12, 3, 2, 3] and [12, 4, 2, 4]; of the last two pairs e = 0."""
-    rng = np.random.default_rng(8)
-    sources, targets = (np.stack([random_model(rng, n, 2, 1.0) for _ in range(12)]) for n in (3, 4))
-    targets[10:] = 0.0
-    targets[10:, :3, :, :3] = sources[10:]
-    targets[10:, 3, :, 0] = 1.0
-    return sources, targets
-
-
-@functools.cache
-def small_errors(anchored):
-    pairs = zip(*small_pairs(), strict=True)
-    return np.array([oracles.homomorphism_lp(*pair, anchored)[0] for pair in pairs])
-
-
-@functools.cache
-def compiled(anchored):
-    """Values and derivatives of all twelve pairs."""
-    error = functools.partial(homomorphism_error, anchored=anchored)
-    return jax.jit(jax.vmap(jax.value_and_grad(error, argnums=(0, 1))))
-
-
-@pytest.mark.parametrize("anchored", [True, False])
-def test_value(anchored):
-    values, _ = compiled(anchored)(*small_pairs())
-    np.testing.assert_allclose(values, small_errors(anchored), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("anchored", [True, False])
-def test_gradient_against_differences_of_highs(anchored):
-    """In random directions that keep the sums of rows; at a kink, between the one-sided slopes."""
-    sources, targets = small_pairs()
-    _, gradients = compiled(anchored)(sources, targets)
-    rng, h, smooth = np.random.default_rng(9), 1e-5, 0
-    for i in range(12):
-        directions = [rng.normal(size=model[i].shape) for model in (sources, targets)]
-        directions = [d - d.mean(axis=-1, keepdims=True) for d in directions]
-        for moves in ((1, 0), (0, 1), (1, 1)):
-            ds, dt = (move * d for move, d in zip(moves, directions, strict=True))
-            up, down = (oracles.homomorphism_lp(sources[i] + t * ds, targets[i] + t * dt, anchored)[0] for t in (h, -h))
-            slopes = np.sort([up - small_errors(anchored)[i], small_errors(anchored)[i] - down]) / h
-            slope = np.sum(gradients[0][i] * ds) + np.sum(gradients[1][i] * dt)
-            assert slopes[0] - 2e-3 <= slope <= slopes[1] + 2e-3
-            smooth += slopes[1] - slopes[0] < 1e-3
-    assert smooth >= 28
-
-
-def test_transformations_agree():
-    """Eager calls, jvp, and nested vmap, each over one argument, under jit."""
-    sources, targets = small_pairs()
-    values, gradients = compiled(True)(sources, targets)
-    eager = homomorphism_error(sources[0], targets[0])
-    chex.assert_shape(eager, ())
-    np.testing.assert_allclose(eager, values[0], rtol=0, atol=1e-6)
-    over_targets = jax.vmap(homomorphism_error, in_axes=(None, 0))
-    table = jax.jit(jax.vmap(over_targets, in_axes=(0, None)))(sources[:3], targets[:4])
-    expected = [[oracles.homomorphism_lp(s, t)[0] for t in targets[:4]] for s in sources[:3]]
-    np.testing.assert_allclose(table, expected, rtol=0, atol=1e-6)
-    tangents = sources[0] - sources[1], targets[0] - targets[1]
-    value, slope = jax.jvp(homomorphism_error, (sources[0], targets[0]), tangents)
-    np.testing.assert_allclose(value, values[0], rtol=0, atol=1e-6)
-    expected = sum(np.sum(g[0] * t) for g, t in zip(gradients, tangents, strict=True))
-    np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-4)
-
-
-def test_eager_calls_compile_once(monkeypatch):
-    sources, targets = small_pairs()
-    homomorphism_error(sources[0], targets[0])
-    traces = []
-    monkeypatch.setattr(pdhg, "step", lambda *args: traces.append(args))
-    homomorphism_error(sources[1], targets[1])
-    assert not traces
-
-
-def test_a_pair_that_is_not_a_number_spoils_no_other():
-    sources, targets = (model.copy() for model in small_pairs())
-    sources[0, 0, 0, 0] = np.nan
-    values, gradients = compiled(True)(sources, targets)
-    np.testing.assert_allclose(values[1:], small_errors(True)[1:], rtol=0, atol=1e-6)
-    assert not np.isfinite(values[0]) and np.all(np.isfinite(gradients[0][1:]))
-
-
-def test_one_state():
-    """Anchored, its one row is fixed: the error is what leaves the target's centre. To one state everything fits."""
-    alone = np.ones((1, 2, 1))
-    leaving = np.array([[[0.6, 0.4], [1.0, 0.0]], [[0.0, 1.0], [0.0, 1.0]]])
-    value, slope = jax.value_and_grad(homomorphism_error, argnums=1)(alone, leaving)
-    np.testing.assert_allclose(value, 0.4, rtol=0, atol=1e-6)
-    direction = np.zeros((2, 2, 2))
-    direction[0, 0] = [-1.0, 1.0]
-    np.testing.assert_allclose(np.sum(slope * direction), 1.0, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(homomorphism_error(leaving, alone), 0.0, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(homomorphism_error(alone, leaving, anchored=False), 0.0, rtol=0, atol=1e-6)
-    assert oracles.homomorphism_lp(alone, leaving)[0] == pytest.approx(0.4)
-
-
-@pytest.mark.parametrize(
-    "twice",
-    [
-        jax.hessian(homomorphism_error),
-        jax.jacfwd(jax.jacfwd(homomorphism_error)),
-        jax.jit(jax.jacrev(jax.grad(homomorphism_error))),
-        jax.vmap(jax.hessian(homomorphism_error)),
-    ],
-    ids=["forward over reverse", "forward over forward", "reverse over reverse", "under vmap"],
-)
-def test_second_derivatives_are_refused(twice, request):
-    index = slice(0, 2) if "vmap" in request.node.name else 0
-    with pytest.raises(ValueError, match="homomorphism_error has first derivatives only"):
-        twice(*(model[index] for model in small_pairs()))
-
-
-def test_an_open_bracket_is_no_number(monkeypatch):
-    monkeypatch.setattr(homomorphism_module, "_MAX_ITERATIONS", 16)
-    monkeypatch.setattr(homomorphism_module, "suits_interior_point", lambda *args: False)
-    rng = np.random.default_rng(1)
-    value, slope = jax.value_and_grad(homomorphism_error)(random_model(rng, 3, 2), random_model(rng, 5, 2))
-    assert np.isnan(value) and np.isnan(slope).all()
-
-
-@functools.cache
-def labelled_pairs():
-    """Models of three and four states with one label each."""
-    rng = np.random.default_rng(11)
-    return tuple(np.stack(a) for a in zip(*([rng.dirichlet(np.ones(3), (3, 2)), rng.dirichlet(np.ones(4), (4, 2)),
-                 rng.random((3, 2, 1)), rng.random((4, 2, 1))] for _ in range(4)), strict=True))  # fmt: skip
-
-
-def labelled_error(source, target, source_labels, target_labels):
-    return homomorphism_error(source, target, source_labels=source_labels, target_labels=target_labels)
-
-
-def test_labels_and_their_derivatives():
-    """Against HiGHS, and differences of it, in random directions of all four arrays; forward and in reverse."""
-    pairs = labelled_pairs()
-    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(labelled_error, argnums=(0, 1, 2, 3))))(*pairs)
-    rng, h, smooth = np.random.default_rng(12), 1e-5, 0
-
-    def exact(arrays):
-        return oracles.homomorphism_lp(*arrays[:2], True, arrays[2:])[0]
-
-    for i in range(4):
-        arrays = [array[i] for array in pairs]
-        middle = exact(arrays)
-        np.testing.assert_allclose(values[i], middle, rtol=0, atol=1e-6)
-        moves = [rng.normal(size=array.shape) for array in arrays]
-        moves[:2] = [move - move.mean(axis=-1, keepdims=True) for move in moves[:2]]
-        up, down = (exact([a + t * move for a, move in zip(arrays, moves, strict=True)]) for t in (h, -h))
-        one_sided = np.sort([up - middle, middle - down]) / h
-        slope = sum(np.sum(g[i] * move) for g, move in zip(slopes, moves, strict=True))
-        assert one_sided[0] - 2e-3 <= slope <= one_sided[1] + 2e-3
-        smooth += one_sided[1] - one_sided[0] < 1e-3
-    assert smooth >= 3
-    _, forward = jax.jvp(labelled_error, tuple(arrays), tuple(moves))
-    np.testing.assert_allclose(forward, slope, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("source_labels", "target_labels", "message"),
-    [
-        (np.ones((3, 2, 1)), None, "must be given together"),
-        (np.ones((3, 1, 1)), np.ones((4, 2, 1)), r"source_labels must have shape \[3, 2, L\], got \(3, 1, 1\)"),
-        (np.ones((3, 2, 1)), np.ones((4, 2, 2)), r"target_labels must have shape \(4, 2, 1\), got \(4, 2, 2\)"),
-    ],
-)
-def test_labels_that_do_not_fit_are_refused(source_labels, target_labels, message):
-    source, target = (model[0] for model in small_pairs())
-    with pytest.raises(ValueError, match=message):
-        labelled_error(source, target, source_labels, target_labels)
-
-
-def test_float32_error():
-    sources, targets = (jnp.asarray(model[:4], jnp.float32) for model in small_pairs())
-    values = jax.vmap(homomorphism_error)(sources, targets)
-    assert values.dtype == jnp.float32
-    np.testing.assert_allclose(values, small_errors(True)[:4], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("source", "target", "message"),
-    [
-        ((3, 2), (4, 2, 4), r"source must have shape \[n, A, n\], got \(3, 2\)"),
-        ((3, 2, 4), (4, 2, 4), r"source must have shape \[n, A, n\], got \(3, 2, 4\)"),
-        ((3, 2, 3), (4, 2, 3), r"target must have shape \[n, A, n\], got \(4, 2, 3\)"),
-        ((3, 2, 3), (4, 3, 4), r"target must have shape \[m, 2, m\], got \(4, 3, 4\)"),
-    ],
-)
-def test_shapes_that_do_not_fit_are_refused(source, target, message):
-    with pytest.raises(ValueError, match=message):
-        homomorphism_error(np.ones(source), np.ones(target))

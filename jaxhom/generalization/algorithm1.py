@@ -1,0 +1,119 @@
+"""Algorithm 1 of Boularias and Chaib-draa 2010: the votes of the nearest demonstrated states that are locally similar.
+
+The set s^t of states within t steps of an unvisited state s grows. At the first t at which s^t holds a demonstrated
+state whose local model is similar to that of s, all such states vote with their empirical policies. If s^t stops
+growing before, the policy at s is uniform.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.generalization import evidence
+from jaxhom.generalization.explainers import ByHomomorphism
+from jaxhom.generalization.result import Generalization, extend, may_vote, votes_around
+from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.inputs import as_model
+from jaxhom.models.mdp import MDP
+from jaxhom.similarity.table import Relation, SimilarityTable, table_for
+from jaxhom.status import Status
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool
+
+
+def soft_local_homomorphism(
+    mdp: MDP,
+    demonstrations: Demonstrations,
+    *,
+    distance: int = 1,
+    threshold: float = 0.0,
+    anchored: bool = True,
+    mutual: bool = False,
+    tolerance: float = 1e-4,
+    states: Bool[ArrayLike, " S"] | None = None,
+    table: SimilarityTable | None = None,
+    progress: bool = False,
+    similarity: SimilarityTable | None = None,
+) -> Generalization:
+    """Algorithm 1: the votes of the nearest demonstrated states that are locally similar.
+
+    Args:
+      mdp: the model.
+      demonstrations: the expert's trajectories.
+      distance: d >= 1, the radius of the local models that are compared.
+      threshold: epsilon >= 0, the largest error at which two states count as similar.
+      anchored: require that the centre is mapped to the centre. False is the relation as printed, which on models
+        whose local models have absorbing states accepts nearly every pair.
+      mutual: require the error of both directions to be within the threshold.
+      tolerance: an error up to threshold + tolerance may count as similar; see `locally_similar`.
+      states: bool [S], the states to find a policy for; the others stay uniform. All if None. Leaving out states in
+        which the action does not matter, and which lead to many, saves their large local models.
+      table: a `SimilarityTable` of the same model, `distance` and `anchored`, for many sets of demonstrations or
+        thresholds: pairs of classes that it has met are not solved again. Made anew if None.
+      progress: show a progress bar.
+      similarity: the former name of `table`, which warns.
+
+    Returns:
+      `Generalization`; `radius` is the t at which the algorithm stopped. Pairs of states whose error could not be told
+      from the threshold count as different: `undecided` says how many of a state's, and `status` why.
+
+    Raises:
+      ValueError: if a demonstration does not fit the model, an option is out of range, or `table` is another's.
+
+    Outside jit, vmap and grad only: local models are found on the host.
+
+    Example:
+      >>> import jaxhom
+      >>> grid = jaxhom.gridworld(8)
+      >>> demonstrations = jaxhom.Demonstrations.from_trajectories([([9, 10, 11], [2, 2, 1])])
+      >>> general = jaxhom.soft_local_homomorphism(grid, demonstrations)
+      >>> general.radius.reshape(8, 8)[1].tolist()  # beside the walk, and the right border, which nothing is like
+      [-1, 0, 0, 0, 1, 2, 3, -1]
+
+    Source: Boularias and Chaib-draa 2010, Algorithm 1; anchoring and `mutual` are additions.
+    """
+    if similarity is not None:
+        warnings.warn("similarity is now called table", DeprecationWarning, stacklevel=2)
+        table = similarity
+    mdp = as_model(mdp)
+    table = table_for(table, mdp, distance, anchored)
+    relation = Relation(threshold=threshold, mutual=mutual, tolerance=tolerance)
+    start = uniform_elsewhere(mdp, demonstrations)
+    asking = ~np.asarray(start.visited) & _asked(mdp, states)
+    # All classes that will be met, at once: programs are as wide as the widest class that is known.
+    table.classes(np.flatnonzero(asking | evidence.deciding(mdp, start.visited)))
+    can_vote, status = may_vote(mdp, start), Status.SOLVED
+    undecided = np.zeros(mdp.num_states, np.int32)
+
+    def accept(state, expert):
+        nonlocal status
+        accepted = can_vote(state, expert)
+        state, expert = state[accepted], expert[accepted]
+        accepted[accepted] = table.decide(state, expert, **relation._asdict(), progress=progress)
+        statuses = table.statuses(state, expert, **relation._asdict())
+        np.add.at(undecided, state, statuses != Status.SOLVED)
+        status = max(status, statuses.max(initial=Status.SOLVED))
+        return accepted
+
+    votes = votes_around(mdp, start, accept, asking)
+    ended = {
+        "undecided": checks.to_device(undecided, jnp.int32),
+        "status": checks.to_device(np.asarray(status), jnp.int32),
+    }
+    return extend(mdp, start, votes, ByHomomorphism(mdp, table, relation, asking), **ended)
+
+
+def _asked(mdp: MDP, states) -> np.ndarray:
+    """bool [S]: the states that a policy is wanted for."""
+    if states is None:
+        return np.ones(mdp.num_states, bool)
+    states = checks.as_host_array("states", states)
+    checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == (mdp.num_states,))
+    return states.astype(bool)

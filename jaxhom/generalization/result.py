@@ -1,0 +1,113 @@
+"""What every way to generalize returns: a policy for every state, and where each state's came from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.generalization import evidence
+from jaxhom.generalization.explainers import demonstrated
+from jaxhom.generalization.explanation import Explanation
+from jaxhom.generalization.votes import Votes, vote_of_rings
+from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+
+class Generalization(Record):
+    """A policy for every state, and where each state's came from.
+
+    Attributes:
+      policy: [S, A], rows sum to 1; 0 on actions that are not allowed.
+      visited: bool [S], the demonstrated states, absorbing ones included.
+      radius: int32 [S], how far the method had to look (steps); 0 on demonstrated states, -1 where nothing was
+        found and the policy is uniform.
+      support: int32 [S], how many demonstrated states voted; 1 on demonstrated states, 0 where nothing was found.
+      undecided: int32 [S], how many demonstrated states had no vote because the bounds on the error of a map to them
+        stayed too far apart to tell; 0 for methods that decide nothing.
+      status: int32, a `jaxhom.Status`: SOLVED where nothing stayed undecided and the bounds below are as close as asked
+        for, or else why not.
+      error_lower: scalar, error_lower <= e <= error_upper for the optimal error e of the global program; None for other
+        methods.
+      error_upper: scalar, likewise.
+      explainer: what the method remembers to explain itself, called with the generalization and a state. No part of
+        the pytree: whatever comes out of `jax.tree.map`, `jit` or `vmap` has forgotten it.
+    """
+
+    policy: Float[Array, "S A"]
+    visited: Bool[Array, " S"]
+    radius: Int[Array, " S"]
+    support: Int[Array, " S"]
+    undecided: Int[Array, " S"]
+    status: Int[Array, ""]
+    error_lower: Float[Array, ""] | None = None
+    error_upper: Float[Array, ""] | None = None
+    explainer: Callable[[Generalization, int], Explanation] | None = dataclasses.field(
+        default=None, metadata={"dropped": True}
+    )
+
+    def explain(self, state: Int[ArrayLike, ""]) -> Explanation:
+        """Says where a state's policy came from; `print` it, or read its arrays.
+
+        For Algorithm 1 that is which demonstrated states voted, at what radius, through which map from the state's
+        local model to theirs, and between which certified bounds the error of such a map lies; or that nothing was
+        found. Maps are computed on demand: the first call for models of a new size compiles for a few seconds.
+
+        Args:
+          state: its number.
+
+        Returns:
+          `Explanation`.
+
+        Raises:
+          ValueError: if there is no such state, or the generalization has gone through a JAX transformation and no
+            longer knows how it was made.
+        """
+        if self.explainer is None:
+            raise ValueError(
+                "this generalization no longer knows how it was made: jit, vmap and jax.tree.map drop that; "
+                "ask the one that the method returned"
+            )
+        number = checks.as_host_array("state", state)
+        checks.require_shape("state", number, "(), one state", number.ndim == 0)
+        number = int(checks.require_integers("state", number, upper=len(self.visited)))
+        return (demonstrated if self.visited[number] else self.explainer)(self, number)
+
+
+def extend(mdp: MDP, start: Generalization, votes: Votes, explainer, **more) -> Generalization:
+    """The votes where nothing was demonstrated.
+
+    Args:
+      mdp: the model.
+      start: from `uniform_elsewhere`.
+      votes: for all states; those of demonstrated states do not count.
+      explainer: what explains the result.
+      **more: further fields of the result.
+    """
+    policy = evidence.policy_of_votes(mdp, votes.policy)[0] if mdp.restricts_actions else votes.policy
+    visited = start.visited
+    return start.replace(
+        policy=jnp.where(visited[:, None], start.policy, policy),
+        radius=jnp.where(visited, start.radius, votes.radius),
+        support=jnp.where(visited, start.support, votes.support),
+        explainer=explainer,
+        **more,
+    )
+
+
+def may_vote(mdp: MDP, start: Generalization) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Decides pairs (states [P], demonstrated states [P]): whether the second may vote in the first at all."""
+    decides, policy = evidence.deciding(mdp, start.visited), np.asarray(start.policy)
+    return lambda state, expert: decides[expert] & evidence.has_vote(mdp, policy, state, expert)
+
+
+def votes_around(mdp: MDP, start: Generalization, accept, asking: np.ndarray) -> Votes:
+    """The votes of the nearest accepted states around those that ask, bool [S], none of them demonstrated."""
+    return vote_of_rings(mdp, np.asarray(start.visited), np.asarray(start.policy), asking, accept)

@@ -1,0 +1,61 @@
+"""The demonstrations alone: what the expert did where it was seen, and the uniform policy elsewhere."""
+
+from __future__ import annotations
+
+import warnings
+
+import jax.numpy as jnp
+
+from jaxhom.generalization.explainers import nothing_is_looked_for
+from jaxhom.generalization.result import Generalization
+from jaxhom.models.demonstrations import Demonstrations, empirical_policy
+from jaxhom.models.inputs import as_model
+from jaxhom.models.mdp import MDP
+from jaxhom.status import Status
+
+
+def uniform_elsewhere(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
+    """The uniform policy over the allowed actions on every state that was not demonstrated.
+
+    Args:
+      mdp: the model.
+      demonstrations: the expert's trajectories.
+
+    Returns:
+      `Generalization`, with radius -1 off the demonstrated states.
+
+    Raises:
+      ValueError: if a demonstration does not fit the model.
+
+    Works under jit and vmap, where values are not checked.
+
+    Example:
+      >>> import jaxhom
+      >>> demonstrations = jaxhom.Demonstrations.from_trajectories([([0, 1], [2, 2])])
+      >>> general = jaxhom.uniform_elsewhere(jaxhom.gridworld(4), demonstrations)
+      >>> general.policy[1].tolist(), general.policy[5].tolist()
+      ([0.0, 0.0, 1.0, 0.0], [0.25, 0.25, 0.25, 0.25])
+
+    Source: Boularias and Chaib-draa 2010, section VI, where it is called maximum entropy.
+    """
+    mdp = as_model(mdp)
+    visited, policy = empirical_policy(mdp, demonstrations)
+    return Generalization(
+        policy=policy,
+        visited=visited,
+        radius=jnp.where(visited, 0, -1).astype(jnp.int32),
+        support=visited.astype(jnp.int32),
+        undecided=jnp.zeros_like(visited, jnp.int32),
+        status=jnp.asarray(Status.SOLVED, jnp.int32),
+        explainer=nothing_is_looked_for,
+    )
+
+
+def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
+    """The former name of `uniform_elsewhere`, which warns: it has nothing to do with maximum-entropy inverse RL."""
+    warnings.warn(
+        "maximum_entropy is now called uniform_elsewhere: it is no maximum-entropy inverse reinforcement learning",
+        DeprecationWarning,
+        stacklevel=2,
+    )
+    return uniform_elsewhere(mdp, demonstrations)

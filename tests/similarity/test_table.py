@@ -1,0 +1,148 @@
+"""The table of similarities: asked in any order, it answers as if it were new, and solves nothing twice."""
+
+import functools
+
+import numpy as np
+import oracles
+import pytest
+
+from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar
+from jaxhom.similarity import class_pairs
+from jaxhom.similarity.local_models import local_models
+
+
+@functools.cache
+def model(dtype=np.float64):
+    """Four models of three to five states that never meet, every one of them dense."""
+    rng, transition, first = np.random.default_rng(0), np.zeros((16, 2, 16), dtype), 0
+    for size in (3, 4, 4, 5):
+        last = first + size
+        transition[first:last, :, first:last] = rng.dirichlet(np.ones(size), size=(size, 2))
+        first = last
+    return MDP.from_dense(transition, discount=0.9)
+
+
+SOURCES, TARGETS = np.repeat([0, 3, 8, 11], 4), np.tile([1, 4, 9, 14], 4)
+
+
+@functools.cache
+def optima():
+    tensor = np.asarray(model().transition)
+    around = [oracles.local_model(tensor, s, 1)[1] for s in range(16)]
+    return np.array([oracles.homomorphism_lp(around[s], around[t])[0] for s, t in zip(SOURCES, TARGETS, strict=True)])
+
+
+def test_brackets_serve_every_threshold():
+    table = SimilarityTable(model())
+    found = table.brackets(SOURCES, TARGETS)
+    assert np.all(found.lower <= optima() + 1e-9) and np.all(optima() <= found.upper + 1e-9)
+    solved = table.num_solved
+    for threshold in np.linspace(0.0, 1.0, 9):
+        if np.abs(optima() - threshold).min() > 1e-3:
+            np.testing.assert_array_equal(table.decide(SOURCES, TARGETS, threshold), optima() <= threshold)
+    assert table.num_solved == solved
+
+
+def test_bounds_only_get_better():
+    """Decisions at one threshold and another, then brackets, loose and tight: the better bounds stay."""
+    table, lower, upper = SimilarityTable(model()), 0.0, np.inf
+    table.decide(SOURCES, TARGETS, 0.3)
+    table.decide(SOURCES, TARGETS, 0.1)
+    for tolerance in (2.0, 1e-2, 1e-6, 1e-4):
+        found = table.brackets(SOURCES, TARGETS, tolerance=tolerance)
+        assert np.all(found.lower >= lower) and np.all(found.upper <= upper)
+        assert np.all(found.upper - found.lower <= tolerance) and np.all(found.status == Status.SOLVED)
+        assert np.all(found.lower <= optima() + 1e-9) and np.all(optima() <= found.upper + 1e-9)
+        lower, upper = found.lower, found.upper
+
+
+def test_what_was_decided_is_not_solved_again():
+    table = SimilarityTable(model())
+    first = table.decide(SOURCES, TARGETS, 0.2, mutual=True, tolerance=1e-3)
+    solved = table.num_solved
+    assert 0 < solved <= 2 * len(SOURCES)
+    np.testing.assert_array_equal(table.decide(TARGETS, SOURCES, 0.2, mutual=True, tolerance=1e-3), first)
+    np.testing.assert_array_equal(first, locally_similar(model(), SOURCES, TARGETS, 0.2, mutual=True, tolerance=1e-3))
+    assert table.num_solved == solved
+
+
+def test_a_pair_that_stays_open_is_tried_once_for_each_limit():
+    table = SimilarityTable(model())
+    options = {"tolerance": 1e-9, "method": "pdhg"}
+    found = table.brackets(SOURCES, TARGETS, **options, max_iterations=32)
+    is_open = found.status != Status.SOLVED
+    assert is_open.any() and np.all(found.status[is_open] == Status.ITERATION_LIMIT)
+    solved = table.num_solved
+    again = table.brackets(SOURCES, TARGETS, **options, max_iterations=32)
+    assert table.num_solved == solved
+    np.testing.assert_array_equal(again.upper, found.upper)
+    more = table.brackets(SOURCES, TARGETS, **options, max_iterations=512)
+    assert table.num_solved > solved and (more.upper - more.lower).sum() < (found.upper - found.lower).sum()
+
+
+def test_statuses_of_decisions(monkeypatch):
+    """A pair is open only while neither direction is known to be too far."""
+    near, far = (int(k) for k in (np.argmin(optima()), np.argmax(optima())))
+    between = 0.5 * (optima()[near] + optima()[far])
+    monkeypatch.setattr(class_pairs, "_MAX_PRODUCTS", 0.0)
+    monkeypatch.setattr(class_pairs, "_MIN_ITERATIONS", 1)
+    table = SimilarityTable(model())
+    sources, targets = SOURCES[[near, far]], TARGETS[[near, far]]
+    threshold = optima()[near] - 1e-6  # just missed: takes many iterations to tell
+    assert not table.decide(sources, targets, threshold, tolerance=1e-9).any()
+    assert table.statuses(sources, targets, threshold, tolerance=1e-9)[0] == Status.ITERATION_LIMIT
+    assert table.statuses(sources, targets, 1.0).tolist() == [0, 0] and between > 0
+    assert table.statuses([0], [0], mutual=True).tolist() == [Status.SOLVED]
+
+
+def test_the_complete_table_decides_without_solving():
+    table = SimilarityTable(gridworld(6)).complete(0.2)
+    assert table.num_classes == 9 and len(table._known) == 81
+    solved = table.num_solved
+    sources, targets = np.divmod(np.arange(36 * 36), 36)
+    found = table.decide(sources, targets, 0.2, mutual=True)
+    np.testing.assert_array_equal(found, locally_similar(gridworld(6), sources, targets, 0.2, mutual=True))
+    assert table.num_solved == solved
+
+
+def test_one_table_for_other_functions():
+    table = SimilarityTable(model())
+    first = local_similarity(model(), SOURCES, TARGETS, table=table)
+    assert table.num_solved == len(SOURCES)
+    np.testing.assert_array_equal(locally_similar(model(), SOURCES, TARGETS, 0.3, table=table), first.upper <= 0.3001)
+    assert table.num_solved == len(SOURCES)
+    for options, message in (
+        ({"table": 3}, "table must be a SimilarityTable, got int"),
+        ({"table": table, "anchored": False}, "anchored=True, not with distance=1 and anchored=False"),
+        ({"table": SimilarityTable(gridworld(3))}, "table was made for another model"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            local_similarity(model(), [0], [1], **options)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_maps_are_carried_over_to_every_member_of_a_class(dtype):
+    """On a grid the nine classes' maps serve all pairs of states; each proves its own upper bound."""
+    grid = gridworld(4, dtype=dtype).mdp
+    table = SimilarityTable(grid)
+    sources, targets = np.divmod(np.arange(16 * 16), 16)
+    found = table.maps(sources, targets)
+    assert table.num_solved == 0 and len(table._maps) == 81
+    models = local_models(grid, np.arange(16))
+    for p in range(0, 256, 7):
+        s, t = sources[p], targets[p]
+        n, m = models.size[[s, t]]
+        np.testing.assert_array_equal(found.sources[p, :n], models.members[s, :n])
+        f = found.maps[p, :n, :m].astype(float)
+        product = np.einsum("iaj,jk->iak", models.transition[s, :n, :, :n].astype(float), f)
+        product -= np.einsum("il,lak->iak", f, models.transition[t, :m, :, :m].astype(float))
+        np.testing.assert_allclose(f.sum(axis=1), 1.0, atol=1e-5)
+        assert np.abs(product).max() <= found.upper[p] + 1e-12 and f[0, 0] > 0.999
+    assert (found.status == Status.SOLVED).all()
+    assert (found.upper - found.lower).max() <= (1e-6 if dtype == np.float64 else 1e-4)
+
+
+def test_it_says_what_it_holds():
+    table = SimilarityTable(gridworld(6))
+    table.decide([0, 7], [7, 8])
+    assert repr(table) == "SimilarityTable(36 states, distance 1, anchored; so far 2 classes, 2 pairs of them)"

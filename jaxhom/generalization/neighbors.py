@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxhom import checks
 from jaxhom.generalization import evidence
 from jaxhom.generalization.explainers import ByCoordinates, ByHops
 from jaxhom.generalization.result import Generalization, extend, may_vote, votes_around
 from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.generalization.votes import vote_of_nearest
 from jaxhom.models.demonstrations import Demonstrations
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, check_coordinates
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
@@ -66,10 +65,7 @@ def nearest_neighbors(
         raise ValueError(f'metric must be "hops" or "euclidean", got {metric!r}')
     if coordinates is None:
         raise ValueError('metric="euclidean" needs coordinates [S, D]')
-    coordinates = checks.as_host_array("coordinates", coordinates)
-    good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
-    checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
-    coordinates = checks.require_floats("coordinates", coordinates)
+    coordinates = check_coordinates(mdp, coordinates)
     start = uniform_elsewhere(mdp, demonstrations)
     accept = may_vote(mdp, start) if mdp.restricts_actions else None
     votes = vote_of_nearest(evidence.deciding(mdp, start.visited), np.asarray(start.policy), coordinates, accept)

@@ -63,6 +63,7 @@ class ClassPairs:
             f = np.eye(n, m, dtype=self.dtype) if groups.of_pair[0, 0] == _SAME else np.eye(1, m, dtype=self.dtype)
             return self._without_programs(groups), np.broadcast_to(f, (n, m))
         ((_, widths),) = groups.members()
+        self.num_solved += 1
         found, maps = find_maps(**self._pair(pair[None], widths), goal=self._limited(goal, widths, _MAX_MAP_PRODUCTS))
         return found, maps[0, :n, :m]
 

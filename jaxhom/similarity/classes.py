@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxhom.models.graph import HostGraph
+from jaxhom.models.graph import host_graph
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.canonical_forms import canonical_forms
 from jaxhom.similarity.local_models import LocalModelMaker, is_oversized, validated_states
@@ -107,7 +107,7 @@ def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelC
       ValueError: if a state is out of range or `distance` is below 1.
     """
     states = validated_states(mdp, np.arange(mdp.num_states) if states is None else states, distance)
-    book = ClassBook(LocalModelMaker(HostGraph(mdp), distance))
+    book = ClassBook(LocalModelMaker(host_graph(mdp), distance))
     label = book.labels(states)
     _, first = np.unique(label, return_index=True)
     return LocalModelClasses(label=label, representative=states[first].astype(np.int32), size=book.size)

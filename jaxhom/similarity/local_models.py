@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 
 from jaxhom import checks
-from jaxhom.models.graph import HostGraph
+from jaxhom.models.graph import HostGraph, host_graph
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
@@ -55,7 +55,7 @@ def local_models(mdp: MDP, states, distance: int = 1) -> LocalModels:
     Source: Boularias and Chaib-draa 2010, section V.
     """
     states = validated_states(mdp, states, distance)
-    maker = LocalModelMaker(HostGraph(mdp), distance)
+    maker = LocalModelMaker(host_graph(mdp), distance)
     members = maker.members(states)
     return maker.make(states, int(np.diff(members.indptr).max(initial=1)), members)
 
@@ -86,7 +86,7 @@ def restricted_model(mdp: MDP, states) -> np.ndarray:
     rows = scipy.sparse.csr_array(
         (np.ones(len(states), bool), (np.zeros(len(states), int), states)), shape=(1, mdp.num_states)
     )
-    model = _restrict(HostGraph(mdp), states[:1], rows, len(states))
+    model = _restrict(host_graph(mdp), states[:1], rows, len(states))
     order = np.argsort(model.members[0])  # the first state is its centre, and so already in place
     return model.transition[0][order][..., order]
 

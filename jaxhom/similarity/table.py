@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.models.graph import HostGraph
+from jaxhom.models.graph import host_graph
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
@@ -72,7 +72,7 @@ class SimilarityTable:
         self.mdp = as_model(mdp)
         require_concrete(self.mdp)
         self.distance, self.anchored = checks.require_count("distance", distance), bool(anchored)
-        self._maker = LocalModelMaker(HostGraph(self.mdp), self.distance)
+        self._maker = LocalModelMaker(host_graph(self.mdp), self.distance)
         self._book = ClassBook(self._maker)
         self._pairs = ClassPairs(self._maker, self._book, self.anchored)
         self._known = PairBounds(self.mdp.dtype)

@@ -127,7 +127,7 @@ def test_maps_are_carried_over_to_every_member_of_a_class(dtype):
     table = SimilarityTable(grid)
     sources, targets = np.divmod(np.arange(16 * 16), 16)
     found = table.maps(sources, targets)
-    assert table.num_solved == 0 and len(table._maps) == 81
+    assert table.num_solved == 72 and len(table._maps) == 81
     models = local_models(grid, np.arange(16))
     for p in range(0, 256, 7):
         s, t = sources[p], targets[p]

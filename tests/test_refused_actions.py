@@ -16,6 +16,7 @@ from jaxhom import (
 from jaxhom.models.graph import reachable_within
 from jaxhom.similarity.classes import local_model_classes
 from jaxhom.similarity.local_models import local_models
+from jaxhom.similarity.table import Relation
 
 
 def random_model(rng, num_states=5, num_actions=3):
@@ -100,5 +101,6 @@ def test_a_hub_is_left_open_and_costs_nothing(monkeypatch):
     found = local_similarity(mdp, [50, 3, 50], [3, 50, 50])
     assert found.status.tolist() == [1, 1, 0] and (found.upper[:2] == 1).all() and (found.lower[:2] == 0).all()
     table = SimilarityTable(mdp)
-    assert table.decide([50, 3], [3, 4]).tolist() == [False, True]
-    assert table.statuses([50, 3], [3, 4]).tolist() == [Status.ITERATION_LIMIT, Status.SOLVED]
+    decisions = table.decisions([50, 3], [3, 4], Relation())
+    assert decisions.similar.tolist() == [False, True]
+    assert decisions.status.tolist() == [Status.ITERATION_LIMIT, Status.SOLVED]

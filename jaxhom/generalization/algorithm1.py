@@ -96,10 +96,10 @@ def soft_local_homomorphism(
         nonlocal status
         accepted = can_vote(state, expert)
         state, expert = state[accepted], expert[accepted]
-        accepted[accepted] = table.decide(state, expert, **relation._asdict(), progress=progress)
-        statuses = table.statuses(state, expert, **relation._asdict())
-        np.add.at(undecided, state, statuses != Status.SOLVED)
-        status = max(status, statuses.max(initial=Status.SOLVED))
+        found = table.decisions(state, expert, relation, progress=progress)
+        accepted[accepted] = found.similar
+        np.add.at(undecided, state, found.status != Status.SOLVED)
+        status = max(status, found.status.max(initial=Status.SOLVED))
         return accepted
 
     votes = votes_around(mdp, start, accept, asking)

@@ -49,8 +49,7 @@ class ByHomomorphism:
         # Those nearer were refused when their ring was reached, or the search would have ended there.
         candidates = _experts(self.mdp, general, state)
         candidates = candidates[steps[candidates] == radius]
-        relation = self.relation._asdict()
-        voters = candidates[self.table.decide(np.full(len(candidates), state), candidates, **relation)]
+        voters = candidates[self.table.decisions(np.full(len(candidates), state), candidates, self.relation).similar]
         here = np.full(len(voters), state)
         reason = f"{_voted(voters)}, {_steps(radius)} away.{_undecided(general, state)}"
         return dataclasses.replace(

@@ -11,7 +11,7 @@ from jaxhom.similarity.maps import CertifiedMaps
 from jaxhom.status import Record, Status, bracket
 
 _MAX_VOTERS = 12  # of which the text shows a line each
-_MAX_MAPS = 3
+_MAX_MAPS = 3  # that are written out
 _MAX_ROWS = 10  # of a map
 _MAX_TERMS = 4  # of a row
 _LEAST_SHARE = 1e-4  # of a row, to count as more than the solver's tolerance

@@ -14,6 +14,10 @@ too early, SciPy's HiGHS does. The optimal x need not be unique: the interior-po
 optimal ones.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
@@ -32,11 +36,16 @@ from jaxhom.solvers.normal_equations import Rows
 from jaxhom.solvers.sparse_interior_point import solve
 from jaxhom.status import Status
 
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float
+
 _TOLERANCE = 1e-7  # of the objective and of the residuals, as a share of all discounted time
 _GOOD_ENOUGH = 1e-5  # beyond which HiGHS has to do it
 
 
-def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) -> Generalization:
+def occupancy_regression(
+    mdp: MDP, demonstrations: Demonstrations, coordinates: Float[ArrayLike, "S D"]
+) -> Generalization:
     """Extends the expert's policy by a quadratic regression of the state occupancy.
 
     Args:
@@ -51,6 +60,16 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
     Raises:
       ValueError: if a demonstration does not fit the model, or `coordinates` do not.
       RuntimeError: if no solver finds an optimum.
+
+    Outside jit, vmap and grad only: the linear program is solved on the host.
+
+    Example:
+      >>> import jaxhom
+      >>> grid = jaxhom.gridworld(4)
+      >>> demonstrations = jaxhom.Demonstrations.from_trajectories([([0, 1, 5], [2, 1, 2])])
+      >>> general = jaxhom.occupancy_regression(grid, demonstrations, grid.coordinates)
+      >>> general.policy.shape, int(general.support[10])
+      ((16, 4), 3)
 
     Source: Boularias and Chaib-draa 2010, section VI; the linear program is written out above.
     """

@@ -24,7 +24,7 @@ from jaxhom.solvers import pdhg
 from jaxhom.solvers.lane_queue import is_settled
 from jaxhom.status import Status
 
-_ITERATIONS_PER_REPORT = 320
+_ITERATIONS_PER_REPORT = 320  # a program cannot be interrupted
 
 
 def soft_homomorphism(

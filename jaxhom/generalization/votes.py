@@ -13,7 +13,7 @@ import numpy as np
 from jaxhom.models.graph import reachable_within
 from jaxhom.models.mdp import MDP
 
-_CHUNK_BYTES = 64 * 2**20
+_CHUNK_BYTES = 64 * 2**20  # of distances at a time
 _TIE = 1e-9  # relative difference of two distances that rounding may have made
 
 

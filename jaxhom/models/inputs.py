@@ -15,7 +15,7 @@ from jaxhom import checks
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, ArrayLike, Float, Num
+    from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 
 def as_model(mdp: Any) -> MDP:
@@ -66,6 +66,17 @@ def require_policy_shape(mdp: MDP, policy: Any, name: str = "policy", *, batch: 
     good = policy.ndim in ((2, 3) if batch else (2,)) and policy.shape[-2:] == (states, actions)
     checks.require_shape(name, policy, f"({states}, {actions})" + f" or (B, {states}, {actions})" * batch, good)
     return policy
+
+
+def check_states(mdp: MDP, states: Int[ArrayLike, " P"], name: str = "states") -> Int[np.ndarray, " P"]:
+    """Numbers of states, on the host.
+
+    Raises:
+      ValueError: if they are not [P], or one is no whole number in [0, S); under jit, vmap and grad.
+    """
+    states = checks.as_host_array(name, states)
+    checks.require_shape(name, states, "[P]", states.ndim == 1)
+    return checks.require_integers(name, states, upper=mdp.num_states)
 
 
 def check_coordinates(mdp: MDP, coordinates: Float[ArrayLike, "S D"]) -> Float[np.ndarray, "S D"]:

@@ -27,17 +27,17 @@ from jaxhom.status import Record, Status
 
 METHODS = ("auto", "pdhg", "interior_point")
 
-_MAX_LANES = 64
-_BATCH_BYTES = 32 * 2**20
-_CHUNK_PAIRS = 16_384
+_MAX_LANES = 64  # of PDHG: they fill a CPU's vector units, and more wait for the slowest
+_BATCH_BYTES = 32 * 2**20  # of a batch of PDHG
+_CHUNK_PAIRS = 16_384  # that are on the host as copies with the lanes last
 MAX_INTERIOR_SIZE = 32  # larger models: the normal matrix has (n m)^2 entries
 _MAX_INTERIOR_LANES = 128
-_FEW_LANES = 16
-_FEW_PDHG_LANES = 8
+_FEW_LANES = 16  # a handful of pairs is one narrow batch: a step costs what its lanes cost, used or not
+_FEW_PDHG_LANES = 8  # the same for PDHG
 _FEW_BYTES = 2**19  # more than that in a batch of a few pairs' lanes is repeated work worth a program of its own
 _SMALL_ROUNDING = 0.125  # of the tolerance: nothing is done about it
 _NOISE = 32.0  # times eps: closer than that an iteration does not come
-_INTERIOR_BYTES = 2 * 2**20
+_INTERIOR_BYTES = 2 * 2**20  # of a batch's normal matrices: a core's own cache
 _TIGHT = 1e-3  # wider gaps PDHG closes sooner
 _MAP_LANES = 8  # maps are asked for a few at a time
 

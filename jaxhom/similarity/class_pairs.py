@@ -17,10 +17,10 @@ from jaxhom.status import Status
 
 _SMALL = 8  # local models up to this size share one padding
 _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
-_CHUNK_BYTES = 256 * 2**20
-_MAX_PRODUCTS = 2e11  # multiplications per pair: large models stop early, with the bounds they have
-_MAX_MAP_PRODUCTS = 2e10  # a map is waited for
-_MIN_ITERATIONS = 64
+_CHUNK_BYTES = 256 * 2**20  # of local models that are built at a time
+_MAX_PRODUCTS = 2e11  # multiplications per pair, a minute or two: large models stop with the bounds that they have
+_MAX_MAP_PRODUCTS = 2e10  # the same for a map, which somebody waits for
+_MIN_ITERATIONS = 64  # however large
 _SAME, _TOO_LARGE = -1, -2  # in place of a size group
 
 

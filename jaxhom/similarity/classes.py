@@ -18,8 +18,8 @@ from jaxhom.similarity.canonical_forms import canonical_forms
 from jaxhom.similarity.local_models import LocalModelMaker, is_oversized, validated_states
 from jaxhom.status import Record
 
-_CHUNK_BYTES = 64 * 2**20
-_CHUNK_ENTRIES = 2**22
+_CHUNK_BYTES = 64 * 2**20  # of transition tensors at a time
+_CHUNK_ENTRIES = 2**22  # of transitions that make them
 
 
 class LocalModelClasses(Record):

@@ -27,8 +27,8 @@ import jax.numpy as jnp
 
 from jaxhom.solvers.projections import project_l1_ball, project_simplex
 
-_MAX_UNROLL = 32
-_MAX_TERMS = 64
+_MAX_UNROLL = 32  # states of both models; more take XLA longer than they save
+_MAX_TERMS = 64  # of one sum
 
 
 @jax.tree_util.register_dataclass

@@ -20,9 +20,9 @@ from jaxhom.similarity.newton import factorise
 from jaxhom.solvers.lane_queue import Solver, is_settled, run_lanes
 from jaxhom.solvers.programs import host_jit
 
-MAX_ITERATIONS = 60
-_TO_BOUNDARY = 0.99
-_CORRECTORS = 2
+MAX_ITERATIONS = 60  # ten are usual
+_TO_BOUNDARY = 0.99  # of the way: points stay positive
+_CORRECTORS = 2  # after Mehrotra's, at most
 _CENTRED = (0.1, 10.0)  # products y s within these multiples of mu are left alone
 
 

@@ -16,6 +16,7 @@ import scipy.sparse
 
 from jaxhom import checks
 from jaxhom.models.graph import HostGraph, host_graph
+from jaxhom.models.inputs import check_states
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
@@ -106,9 +107,7 @@ def validated_states(mdp: MDP, states, distance: int) -> np.ndarray:
     """States [P] as integers, or `ValueError`; a traced model or a distance below 1 is refused too."""
     require_concrete(mdp)
     checks.require_count("distance", distance)
-    states = checks.as_host_array("states", states)
-    checks.require_shape("states", states, "[P]", states.ndim == 1)
-    return checks.require_integers("states", states, upper=mdp.num_states)
+    return check_states(mdp, states)
 
 
 def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int) -> LocalModels:

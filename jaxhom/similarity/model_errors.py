@@ -22,8 +22,8 @@ from jaxhom.solvers.first_order import first_order_only
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Float
 
-_CHUNK_LANES = 32  # under vmap
-_MAX_ITERATIONS = 100_000
+_CHUNK_LANES = 32  # under vmap: they fit into the cache, and wait for the slowest of the few
+_MAX_ITERATIONS = 100_000  # then the error is NaN
 
 
 def homomorphism_error(

@@ -14,8 +14,11 @@ is not differentiable, one of the one-sided derivatives comes back.
 jaxopt is no longer maintained; this is the one module that uses it.
 """
 
+from __future__ import annotations
+
 import functools
 import warnings
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -28,12 +31,19 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
     from jaxopt import implicit_diff, linear_solve
 
-_MAX_ITERATIONS = 100_000
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Float
+
+_MAX_ITERATIONS = 100_000  # some 1 / regularization are usual
 
 
 def homomorphism_map(
-    source: jax.Array, target: jax.Array, *, regularization: float = 1e-2, anchored: bool = True
-) -> jax.Array:
+    source: Float[ArrayLike, "n A n"],
+    target: Float[ArrayLike, "m A m"],
+    *,
+    regularization: float = 1e-2,
+    anchored: bool = True,
+) -> Float[Array, "n m"]:
     """The map f of the regularised program, as a differentiable function of both models.
 
     Args:
@@ -47,6 +57,12 @@ def homomorphism_map(
 
     Raises:
       ValueError: if the shapes do not fit or `regularization` is not positive.
+
+    Example:
+      >>> import jaxhom, numpy as np
+      >>> swap = np.array([[[0.0, 1.0]], [[1.0, 0.0]]])  # two states that change places
+      >>> jaxhom.homomorphism_map(swap, swap).round(2).tolist()
+      [[1.0, 0.0], [0.0, 1.0]]
 
     Source: Boularias and Chaib-draa 2010, eq. (9), regularised.
     """

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.graph import host_graph
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, check_states
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
 from jaxhom.similarity.class_pairs import ClassPairs
@@ -22,20 +22,32 @@ from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys
 from jaxhom.solvers.lane_queue import is_settled
-from jaxhom.status import Status
+from jaxhom.status import Record, Status
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Int
 
-_MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}
+_MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}  # below what an explanation prints
 
 
 class Relation(NamedTuple):
-    """When one state counts as similar to another; the fields are arguments of `SimilarityTable.decide`."""
+    """When one state counts as similar to another; the fields are those arguments of `SimilarityTable.decide`."""
 
     threshold: float = 0.0
     mutual: bool = False
     tolerance: float = 1e-4
+
+
+class Decisions(Record):
+    """Which of P pairs of states are similar.
+
+    Attributes:
+      similar: bool [P].
+      status: int32 [P], a `jaxhom.Status`: SOLVED where the bounds decide, or else why they do not.
+    """
+
+    similar: np.ndarray
+    status: np.ndarray
 
 
 class SimilarityTable:
@@ -102,7 +114,7 @@ class SimilarityTable:
         """
         if states is None:
             return self._book.labels(np.arange(self.mdp.num_states))
-        return self._book.labels(self._validated("states", states))
+        return self._book.labels(check_states(self.mdp, states))
 
     def brackets(
         self,
@@ -139,31 +151,31 @@ class SimilarityTable:
         Arguments, result and errors are those of `locally_similar`. Only pairs of classes that the bounds so far do not
         decide are solved.
         """
-        goal = Goal.checked(tolerance=tolerance, threshold=threshold)
-        pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
-        return self._decide(pairs, goal, mutual, progress)[where]
+        relation = Relation(threshold, mutual, tolerance)
+        return self.decisions(sources, targets, relation, progress=progress).similar
 
-    def statuses(
+    def decisions(
         self,
         sources: Int[ArrayLike, " P"],
         targets: Int[ArrayLike, " P"],
-        threshold: float = 0.0,
+        relation: Relation,
         *,
-        mutual: bool = False,
-        tolerance: float = 1e-4,
-    ) -> np.ndarray:
-        """int32 [P]: a `jaxhom.Status`, SOLVED where the bounds so far decide e <= threshold, or else why they do not.
-
-        What is not decided counts as different. Solves nothing; arguments as in `decide`.
-        """
-        goal = Goal.checked(tolerance=tolerance, threshold=threshold)
+        progress: bool = False,
+    ) -> Decisions:
+        """As `decide`, and says which of the pairs that count as different could not be decided, and why."""
+        goal = Goal.checked(tolerance=relation.tolerance, threshold=relation.threshold)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
-        status = self._decision_status(pairs, goal)
-        if mutual:  # one direction that is too far decides the pair
-            back = pairs[:, ::-1]
-            is_far = self._is_far(pairs, goal) | self._is_far(back, goal)
-            status = np.where(is_far, Status.SOLVED, np.maximum(status, self._decision_status(back, goal)))
-        return status.astype(np.int32)[where]
+        back = pairs[:, ::-1]
+        is_asked = ~self._is_far(back, goal) if relation.mutual else np.ones(len(pairs), bool)
+        self._settle(pairs[is_asked], goal, progress)
+        similar, is_far = is_asked & self._is_similar(pairs, goal), self._is_far(pairs, goal)
+        status = self._known.look_up(pairs).status
+        if relation.mutual:
+            self._settle(back[similar], goal, progress)
+            is_far |= self._is_far(back, goal)
+            status = np.where(similar, self._known.look_up(back).status, status)
+            similar &= self._is_similar(back, goal)
+        return Decisions(similar=similar[where], status=_status(similar | is_far, status)[where])
 
     def complete(self, threshold: float = 0.0, *, tolerance: float = 1e-4, progress: bool = False) -> SimilarityTable:
         """Decides e <= threshold for all ordered pairs of classes of the model, and returns the table."""
@@ -220,25 +232,11 @@ class SimilarityTable:
         if len(pairs):
             self._known.add(pairs, self._pairs.brackets(pairs, goal, progress=progress), goal)
 
-    def _decide(self, pairs: np.ndarray, goal: Goal, mutual: bool, progress: bool) -> np.ndarray:
-        """bool [Q], for different pairs of classes [Q, 2]."""
-        back = pairs[:, ::-1]
-        is_asked = ~self._is_far(back, goal) if mutual else np.ones(len(pairs), bool)
-        self._settle(pairs[is_asked], goal, progress)
-        similar = is_asked & self._is_similar(pairs, goal)
-        if mutual:
-            self._settle(back[similar], goal, progress)
-            similar &= self._is_similar(back, goal)
-        return similar
-
     def _is_similar(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
         return self._known.look_up(pairs).upper <= goal.threshold + goal.tolerance
 
     def _is_far(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
         return (self._known.look_up(pairs).lower > goal.threshold) & ~self._is_similar(pairs, goal)
-
-    def _decision_status(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
-        return _status(self._is_similar(pairs, goal) | self._is_far(pairs, goal), self._known.look_up(pairs).status)
 
     def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""
@@ -254,14 +252,9 @@ class SimilarityTable:
         return pairs[first], where
 
     def _validated_pairs(self, sources, targets) -> tuple[np.ndarray, np.ndarray]:
-        sources, targets = self._validated("sources", sources), self._validated("targets", targets)
+        sources, targets = check_states(self.mdp, sources, "sources"), check_states(self.mdp, targets, "targets")
         checks.require_shape("targets", targets, str(sources.shape), len(sources) == len(targets))
         return sources, targets
-
-    def _validated(self, name: str, states) -> np.ndarray:
-        states = checks.as_host_array(name, states)
-        checks.require_shape(name, states, "[P]", states.ndim == 1)
-        return checks.require_integers(name, states, upper=self.mdp.num_states)
 
 
 def table_for(table: SimilarityTable | None, mdp: MDP, distance: int, anchored: bool) -> SimilarityTable:
@@ -273,7 +266,7 @@ def table_for(table: SimilarityTable | None, mdp: MDP, distance: int, anchored: 
         return SimilarityTable(mdp, distance=distance, anchored=anchored)
     if not isinstance(table, SimilarityTable):
         raise ValueError(f"table must be a SimilarityTable, got {type(table).__name__}")
-    if table.mdp is not as_model(mdp):
+    if not _same_transitions(table.mdp, as_model(mdp)):
         raise ValueError("table was made for another model")
     if (table.distance, table.anchored) != (distance, bool(anchored)):
         raise ValueError(
@@ -281,6 +274,18 @@ def table_for(table: SimilarityTable | None, mdp: MDP, distance: int, anchored: 
             f"not with distance={distance} and anchored={anchored}"
         )
     return table
+
+
+def _same_transitions(one: MDP, other: MDP) -> bool:
+    """Whether two models have the same local models: features, discount and initial distribution may differ."""
+
+    def parts(mdp):
+        return mdp.next_state, mdp.probability, mdp.allowed
+
+    return one is other or all(
+        a is b or (a.shape == b.shape and a.dtype == b.dtype and np.array_equal(a, b))
+        for a, b in zip(parts(one), parts(other), strict=True)
+    )
 
 
 def _status(is_met: np.ndarray, status: np.ndarray) -> np.ndarray:

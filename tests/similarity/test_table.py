@@ -9,6 +9,7 @@ import pytest
 from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar
 from jaxhom.similarity import class_pairs
 from jaxhom.similarity.local_models import local_models
+from jaxhom.similarity.table import Relation
 
 
 @functools.cache
@@ -83,16 +84,16 @@ def test_a_pair_that_stays_open_is_tried_once_for_each_limit():
 def test_statuses_of_decisions(monkeypatch):
     """A pair is open only while neither direction is known to be too far."""
     near, far = (int(k) for k in (np.argmin(optima()), np.argmax(optima())))
-    between = 0.5 * (optima()[near] + optima()[far])
     monkeypatch.setattr(class_pairs, "_MAX_PRODUCTS", 0.0)
     monkeypatch.setattr(class_pairs, "_MIN_ITERATIONS", 1)
     table = SimilarityTable(model())
     sources, targets = SOURCES[[near, far]], TARGETS[[near, far]]
     threshold = optima()[near] - 1e-6  # just missed: takes many iterations to tell
-    assert not table.decide(sources, targets, threshold, tolerance=1e-9).any()
-    assert table.statuses(sources, targets, threshold, tolerance=1e-9)[0] == Status.ITERATION_LIMIT
-    assert table.statuses(sources, targets, 1.0).tolist() == [0, 0] and between > 0
-    assert table.statuses([0], [0], mutual=True).tolist() == [Status.SOLVED]
+    found = table.decisions(sources, targets, Relation(threshold, tolerance=1e-9))
+    assert not found.similar.any() and found.status[0] == Status.ITERATION_LIMIT
+    for mutual in (False, True):
+        assert table.decisions(sources, targets, Relation(1.0, mutual)).status.tolist() == [0, 0]
+    assert table.decisions([0], [0], Relation(mutual=True)).status.tolist() == [Status.SOLVED]
 
 
 def test_the_complete_table_decides_without_solving():

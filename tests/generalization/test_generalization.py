@@ -15,6 +15,7 @@ from jaxhom import (
     SimilarityTable,
     Status,
     gridworld,
+    local_similarity,
     maximum_entropy,
     nearest_neighbors,
     racetrack,
@@ -184,11 +185,15 @@ def test_the_former_name_of_uniform_elsewhere_warns():
 
 
 def test_what_could_not_be_decided_is_said(monkeypatch):
-    """With no iterations to speak of, pairs stay open: they count as different, and the result and its text say so."""
+    """A threshold beside an error, and few iterations: pairs stay open, and the result and its text say so."""
     here = world("grid")
+    representatives = np.array([0, 1, 7, 8, 9, 15, 56, 57, 63])
+    pairs = np.repeat(representatives, 9), np.tile(representatives, 9)
+    errors = local_similarity(here.mdp, *pairs, tolerance=1e-7).lower
+    beside = float(np.median(errors[errors > 0.1])) - 1e-6
     monkeypatch.setattr(class_pairs, "_MAX_PRODUCTS", 0.0)
     monkeypatch.setattr(class_pairs, "_MIN_ITERATIONS", 1)
-    result = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3)
+    result = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=beside, tolerance=1e-9)
     undecided, visited = np.asarray(result.undecided), np.asarray(result.visited)
     assert undecided.sum() > 0 and not undecided[visited].any()
     assert Status(int(result.status)) == Status.ITERATION_LIMIT

@@ -213,8 +213,8 @@ def test_the_same_answer_to_the_last_bit(monkeypatch):
     order = rng.permutation(400)
     reordered = bracket_errors(source[order], target[order], goal=Goal(method="pdhg", tolerance=1e-5))
     for field in ("lower", "upper", "iterations", "status"):
-        np.testing.assert_array_equal(first[field], again[field])
-        np.testing.assert_array_equal(first[field][order], reordered[field])
+        np.testing.assert_array_equal(getattr(first, field), getattr(again, field))
+        np.testing.assert_array_equal(getattr(first, field)[order], getattr(reordered, field))
 
 
 @pytest.mark.parametrize("method", METHODS)

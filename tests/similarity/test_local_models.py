@@ -93,7 +93,7 @@ def test_states_in_any_order_and_repeated():
     np.testing.assert_array_equal(models.members[0], [7, 2, 6, 8, 12])
     np.testing.assert_array_equal(models.members[1], [0, 1, 5, -1, -1])
     for field in ("members", "size", "transition"):
-        np.testing.assert_array_equal(models[field][0], models[field][2])
+        np.testing.assert_array_equal(getattr(models, field)[0], getattr(models, field)[2])
 
 
 def test_no_states_at_all():

@@ -19,15 +19,14 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
 
 ACTIONS = ("up", "down", "left", "right")
 _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
 _REWARDED_FRACTION = 0.1  # probability that a region's weight is not zero
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class Gridworld:
+class Gridworld(Record):
     """A gridworld and its geometry; state = row * size + column, row 0 on top. See `gridworld`.
 
     Attributes:

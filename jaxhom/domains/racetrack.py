@@ -40,6 +40,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.domains.track_maps import read_map
 from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
 
 ACTIONS = ("nothing", "up", "down", "left", "right")
 SHIPPED_STARTS = {"a": ((7, 0),), "b": None}
@@ -53,9 +54,7 @@ _WEIGHTS = (5.0, 200.0)
 _ON_ROAD, _FINISH, _OFF_ROAD = range(3)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class Racetrack:
+class Racetrack(Record):
     """A racetrack and its geometry: C open cells, S = 25 C states, A = 5. See `racetrack`.
 
     Attributes:

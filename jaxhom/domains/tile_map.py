@@ -7,16 +7,14 @@ an environment's table say, has none; `TileMap` lays its states out on a map.
 import dataclasses
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class TileMap:
+class TileMap(Record):
     """A model on a map: the cell (r, c) of R x C cells is state r C + c. Build it with `TileMap.from_rows`.
 
     Attributes:

@@ -9,7 +9,6 @@ import functools
 import operator
 from collections.abc import Iterator
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +17,10 @@ from jaxhom import checks
 from jaxhom.models import episode_ends, impossible_steps
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, uniform_policy
+from jaxhom.status import Record
 
 
-@chex.dataclass(frozen=True, kw_only=True, mappable_dataclass=False)
-class Demonstrations:
+class Demonstrations(Record):
     """M trajectories of at most H steps. Build it with `Demonstrations.from_trajectories`.
 
     `len` is M. `demonstrations[i]` is trajectory i as a pair of NumPy arrays, as `from_trajectories` takes it; a slice

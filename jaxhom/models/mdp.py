@@ -31,15 +31,14 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.models.padded_rows import PaddedRows, gather_sum, narrow_width, pad_rows
 from jaxhom.models.policy_chain import Edges, find_edges
+from jaxhom.status import Record
 
 _REPLACEABLE = ("discount", "initial", "features", "probability", "allowed")
 _MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one: programs would take minutes to compile
 _DENSE_FRACTION = 0.25  # dense layout from N >= S / 4 on, where products beat gathers
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class MDP:
+class MDP(Record):
     """A finite MDP without reward. Build it with `MDP.from_dense` or `MDP.from_successors`.
 
     Attributes:
@@ -216,6 +215,17 @@ class MDP:
             features=jnp.where(keep, self.features, 0.0),
             restricts_actions=not allowed.all(),
         )
+
+    def _figures(self) -> dict:
+        layout = {"layout": "dense"} if self.is_dense else {"layout": "successors", "width": self.next_state.shape[-1]}
+        return {
+            "num_states": self.num_states,
+            "num_actions": self.num_actions,
+            "num_features": self.num_features,
+            "discount": self.discount,
+            "dtype": str(self.dtype),
+            **layout,
+        }
 
     @property
     def num_states(self) -> int:

@@ -4,18 +4,16 @@ Sparse products run on padded rows: entry [r, n] names the n-th number that row 
 than most (a restart anywhere on a track, say) would make every row pay for them, so they are kept apart.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom.status import Record
+
 _MAX_UNROLL = 16
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class PaddedRows:
+class PaddedRows(Record):
     """One list per row, split so that a few long ones do not widen all of them.
 
     Attributes:

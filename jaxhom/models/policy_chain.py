@@ -6,20 +6,17 @@ for the Markov chain of a policy, P_pi(s, s') = sum_a pi(s, a) T(s, a, s'), forw
 time, backward, with as many weights per edge as there are actions.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhom.models.padded_rows import PaddedRows, gather_sum, pad_rows, sum_rows
+from jaxhom.status import Record
 
 _MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Edges:
+class Edges(Record):
     """The graph of a model in the successor layout.
 
     Attributes:
@@ -36,9 +33,7 @@ class Edges:
     incoming: PaddedRows
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class PolicyChain:
+class PolicyChain(Record):
     """P_pi of one policy, or of B with weights that have a trailing axis [B]."""
 
     successor: PaddedRows
@@ -55,9 +50,7 @@ class PolicyChain:
         return sum_rows(self.predecessor, self.predecessor_weight, occupancy)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class ActionChains:
+class ActionChains(Record):
     """T(s, a, s') for all actions.
 
     Attributes:

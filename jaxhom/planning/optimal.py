@@ -18,7 +18,6 @@ so rounding does not decide. An action that is not allowed has the value -inf.
 import functools
 from collections.abc import Callable
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +30,7 @@ from jaxhom.planning import policy_iteration
 from jaxhom.planning.chain_solver import solve_chain
 from jaxhom.planning.host_chains import host_model, is_at_hand
 from jaxhom.planning.sensitivity import with_derivatives
-from jaxhom.status import Status
+from jaxhom.status import Record, Status
 
 _BLOCK = 16  # sweeps per look at the bounds
 _STALL = 16.0  # a span of this many roundings of the largest value is taken for converged
@@ -43,8 +42,7 @@ _POLISHED_STATES = 20_000
 _VISIBLE = 0.01  # of the values: where rounding may have made more than that, float32 has no answer
 
 
-@chex.dataclass(frozen=True)
-class Plan:
+class Plan(Record):
     """An optimal policy and what certifies it; with a batch of B rewards every field gains a leading axis [B].
 
     Under `jax.grad` and `jax.jvp` value and action_value have derivatives (`jaxhom.planning.sensitivity`); the rest is

@@ -18,7 +18,6 @@ import functools
 import operator
 from collections.abc import Mapping
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,10 +26,10 @@ from jaxhom import checks
 from jaxhom.models.demonstrations import sample_demonstrations
 from jaxhom.models.inputs import as_model, check_policy, check_reward, require_policy_shape
 from jaxhom.models.mdp import MDP, push_forward
+from jaxhom.status import Record
 
 
-@chex.dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Record):
     """What a policy achieves; with a batch of B policies every number gains a leading axis [B].
 
     Attributes:

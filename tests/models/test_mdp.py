@@ -11,6 +11,7 @@ import pytest
 import small_models
 
 from jaxhom import checks
+from jaxhom.domains.gridworld import gridworld
 from jaxhom.models.mdp import MDP, expected_next_value, push_forward, state_transition
 
 
@@ -424,3 +425,11 @@ def test_features_of_states_are_zero_where_an_action_does_not_exist():
     allowed = np.array([[True, False], [True, True]])
     mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.9, features=np.ones((2, 3)), allowed=allowed)
     np.testing.assert_array_equal(np.asarray(mdp.features), np.broadcast_to(allowed[..., None], (2, 2, 3)))
+
+
+def test_models_are_short_when_printed():
+    text = repr(gridworld(5, num_regions=25).mdp)
+    start = "MDP(num_states=25, num_actions=4, num_features=25, discount=0.99, dtype='float64', "
+    assert text == start + "layout='successors', width=4)"
+    axes = jax.tree.map(lambda _: None, gridworld(5).mdp)
+    assert repr(axes).startswith("MDP(")

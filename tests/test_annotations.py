@@ -12,8 +12,7 @@ import jaxhom
 from jaxhom import interop, plotting
 
 DOORS = (jaxhom, interop, plotting)
-NOT_YET = {
-}  # public functions that wait for their annotations; nothing is added here
+NOT_YET = {}  # public functions that wait for their annotations; nothing is added here
 
 
 def public_functions():

@@ -4,6 +4,10 @@ The counterparts of what is drawn on a map: a policy is an image of its probabil
 time, an occupancy a line of spikes, and the radii of a generalization a histogram.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,11 +19,16 @@ from jaxhom.plotting.boards import require
 from jaxhom.plotting.palette import AMOUNT, BLUE, PURPLE, VERMILLION
 from jaxhom.plotting.pictures import unpadded
 
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool, Float, Int
+
 _DECADES = 4  # of an occupancy that are told apart
 _NAMES = ("\N{MULTIPLICATION SIGN} nothing found", "\N{BULLET} demonstrated")
 
 
-def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axes:
+def plot_policy_by_state(
+    policy: Float[ArrayLike, "S A"], *, visited: Bool[ArrayLike, "S"] | None = None, ax: Axes | None = None
+) -> Axes:
     """Draws a policy as an image: states from left to right, actions from top to bottom, dark where likely.
 
     Args:
@@ -40,8 +49,7 @@ def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axe
     if visited is not None:
         visited = require("visited", visited, (num_states,)) > 0
     ax = _axes(ax, height=1.4 + 0.25 * min(num_actions, 12))
-    style = {"aspect": "auto", "interpolation": "nearest", "cmap": AMOUNT, "vmin": 0.0, "vmax": 1.0}
-    image = ax.imshow(policy.T, **style)
+    image = ax.imshow(policy.T, aspect="auto", interpolation="nearest", cmap=AMOUNT, vmin=0.0, vmax=1.0)
     ax.figure.colorbar(image, ax=ax, label="probability").outline.set_visible(False)
     if visited is not None:
         marked = np.flatnonzero(visited)
@@ -54,7 +62,9 @@ def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axe
     return ax
 
 
-def plot_occupancy_by_state(occupancy, *, label: str = "expected discounted visits", ax: Axes | None = None) -> Axes:
+def plot_occupancy_by_state(
+    occupancy: Float[ArrayLike, "S *A"], *, label: str = "expected discounted visits", ax: Axes | None = None
+) -> Axes:
     """Draws how often each state is visited, as spikes on a logarithmic axis.
 
     Args:
@@ -102,7 +112,7 @@ def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None 
     return _plain(ax)
 
 
-def plot_radius_counts(radius, *, ax: Axes | None = None) -> Axes:
+def plot_radius_counts(radius: Int[ArrayLike, "S"], *, ax: Axes | None = None) -> Axes:
     """Draws how many states found advice at which radius.
 
     Args:

@@ -20,10 +20,12 @@ from jaxhom.cli.options import environment_options
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.domains.track_maps import SHIPPED
+from jaxhom.interop.csv_steps import demonstrations_from_csv
+from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environment_maps import tile_map
-from jaxhom.interop.environments import from_gymnasium, make_environment, require_steps_of_table
+from jaxhom.interop.environment_tables import require_steps_of_table
+from jaxhom.interop.environments import from_gymnasium
 from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, load_mdp, load_policy
-from jaxhom.interop.trajectories import demonstrations_from_csv
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
 from jaxhom.models.inputs import check_policy

@@ -22,15 +22,21 @@ Anything that `numpy.savez` wrote with these names is read. What is read goes th
 whatever is wrong is one `FileError` that names the file and the array. A file of a newer format is refused.
 """
 
+from __future__ import annotations
+
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float, Shaped
 
 FORMAT_VERSION = 1
 
@@ -39,7 +45,7 @@ class FileError(ValueError):
     """A file that cannot be read as what it should be; the message is one line that names it."""
 
 
-def load_mdp(path: str | os.PathLike, *, discount: float | None = None) -> MDP:
+def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None = None) -> MDP:
     """Reads a model (see the module's table), in the dtype of its probabilities.
 
     Args:
@@ -105,7 +111,7 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
     return {name: arrays[name] for name in names if name in arrays}
 
 
-def load_policy(path: str | os.PathLike) -> np.ndarray:
+def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
     """Reads a policy [S, A].
 
     Raises:
@@ -125,7 +131,7 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
     Raises:
       OSError: if the file cannot be written.
     """
-    layout = {"transition": mdp.probability} if mdp.is_dense else _fields(mdp, "next_state", "probability")
+    layout = {"transition": np.asarray(mdp.probability)} if mdp.is_dense else _fields(mdp, "next_state", "probability")
     allowed = _fields(mdp, "allowed") if mdp.restricts_actions else {}
     _write(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed})
 
@@ -146,21 +152,21 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     _write(path, {**_fields(demonstrations, "states", "actions", "terminated", "final_states"), "length": length})
 
 
-def save_policy(path: str | os.PathLike, policy, **extras) -> None:
+def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extras: Shaped[ArrayLike, "..."]) -> None:
     """Writes a policy [S, A] and any further arrays by name.
 
     Raises:
       ValueError: if `policy` is none, or an extra has a reserved name or is no plain array.
       OSError: as `save_mdp`.
     """
-    policy = _validated_policy(checks.as_host_array("policy", policy))
+    checked = _validated_policy(checks.as_host_array("policy", policy))
     arrays = {name: checks.as_host_array(name, array) for name, array in extras.items()}
     for name, array in arrays.items():
         if name in ("file", "format_version", "allow_pickle"):
             raise ValueError(f"an array of a policy's file cannot be called {name!r}")
         if array.dtype.hasobject:
             raise ValueError(f"{name} must be a plain array, got dtype {array.dtype}")
-    _write(path, {"policy": policy, **arrays})
+    _write(path, {"policy": checked, **arrays})
 
 
 def _validated_policy(policy: np.ndarray) -> np.ndarray:
@@ -173,7 +179,7 @@ def _fields(value, *names: str) -> dict[str, np.ndarray]:
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike):
+def whole_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """A file to write bytes to that is `path` once all is written: an interrupted write leaves no half of it there.
 
     Raises:
@@ -194,7 +200,8 @@ def whole_file(path: str | os.PathLike):
 
 def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
     with whole_file(path) as file:
-        np.savez_compressed(file, format_version=FORMAT_VERSION, **arrays)
+        named: dict[str, Any] = {"format_version": FORMAT_VERSION, **arrays}
+        np.savez_compressed(file, **named)
 
 
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:

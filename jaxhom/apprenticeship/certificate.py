@@ -14,11 +14,10 @@ import numpy as np
 from jaxhom.apprenticeship.exact import Exact, exact_rows, rounded_down
 from jaxhom.apprenticeship.presolve import Reduction
 from jaxhom.models.mdp import MDP
-from jaxhom.planning.occupancy import occupancy
+from jaxhom.planning.occupancy import NO_OCCUPANCY, occupancy, policy_from_occupancy
 from jaxhom.planning.optimal import Plan, optimal_policy
 from jaxhom.status import Status
 
-NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0, for x that solvers leave near 0
 NEAR_ONE = 0.998  # a discount above which linear systems are better solved on the host
 _EPS = np.finfo(np.float64).eps
 
@@ -206,15 +205,3 @@ def better_bound(one: UpperBound, other: UpperBound) -> UpperBound:
         return jnp.where(take.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
     return jax.tree.map(choose, one, other)
-
-
-def policy_from_occupancy(mdp: MDP, x, fallback, negligible: float = NO_OCCUPANCY):
-    """pi(s, a) = x(s, a) / sum_a' x(s, a') (eq. 5), [B, S, A]; `fallback` where the state's share is negligible.
-
-    In NumPy if x is a NumPy array.
-    """
-    numpy = np if isinstance(x, np.ndarray) else jnp
-    x = numpy.maximum(x, 0.0)
-    total = x.sum(axis=-1, keepdims=True)
-    occurs = total > negligible / (1.0 - (float(mdp.discount) if numpy is np else mdp.discount))
-    return numpy.where(occurs, x / numpy.where(occurs, total, 1.0), fallback)

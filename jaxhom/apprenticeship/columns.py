@@ -25,13 +25,14 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom.apprenticeship.certificate import NEAR_ONE, Found, LPALSolution, policy_from_occupancy
+from jaxhom.apprenticeship.certificate import NEAR_ONE, Found, LPALSolution
 from jaxhom.apprenticeship.column_games import capacities, play
 from jaxhom.apprenticeship.exact import Exact
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.responses import evaluate, evaluate_on_host, respond, respond_on_host, with_compact_features
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning.chain_solver import is_solved_by_lu
+from jaxhom.planning.occupancy import policy_from_occupancy
 from jaxhom.solvers.lane_queue import num_cores
 from jaxhom.status import Status
 

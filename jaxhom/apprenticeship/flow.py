@@ -22,12 +22,11 @@ from jaxhom.apprenticeship.certificate import (
     UpperBound,
     better_bound,
     bound_by_planning,
-    policy_from_occupancy,
 )
 from jaxhom.apprenticeship.flow_factor import factor_flow
 from jaxhom.apprenticeship.flow_lp import FlowProblem
 from jaxhom.models.mdp import MDP, uniform_policy
-from jaxhom.planning.occupancy import occupancy
+from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
 from jaxhom.solvers import pdhg
 from jaxhom.status import Status
 

@@ -100,8 +100,8 @@ def from_samples(
 
     Example:
       >>> model = from_samples([0, 0, 0], [0, 0, 0], [1, 1, 0], num_states=2, num_actions=1, discount=0.9, prior=1.0)
-      >>> model.mdp.transition[0], model.count[:, 0]  # (2 + 1) / (3 + 2) of the mass goes to state 1
-      (Array([[0.4, 0.6]], dtype=float32), Array([3, 0], dtype=int32))
+      >>> model.mdp.transition[0].tolist(), model.count[:, 0].tolist()  # (2 + 1) / (3 + 2) of the mass goes to state 1
+      ([[0.4, 0.6]], [3, 0])
     """
     num_states = checks.require_count("num_states", num_states)
     num_actions = checks.require_count("num_actions", num_actions)

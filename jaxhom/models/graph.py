@@ -10,7 +10,10 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
+from jaxhom import checks
 from jaxhom.models.mdp import MDP
+
+_MEMORY = "_host_graph"  # under which an instance of a model keeps its graph: no field, and so in no pytree
 
 
 class HostGraph:
@@ -70,14 +73,46 @@ class HostGraph:
         return owner, np.arange(len(owner), dtype=np.int64) + shift[owner]
 
 
+def host_graph(mdp: MDP) -> HostGraph:
+    """The graph of a model, made at the first call and remembered by this instance for the next ones.
+
+    It belongs to the instance: what `replace`, `jit`, `vmap` and `jax.tree.map` return, and what comes out of a pickle,
+    makes its own. It may be read by several threads; where two ask first at the same time, both get the same one.
+
+    Args:
+      mdp: the model.
+
+    Returns:
+      Its `HostGraph`, not to be changed.
+
+    Raises:
+      ValueError: if the transitions are traced. Features, discount and initial distribution may be.
+
+    Example:
+      >>> from jaxhom import gridworld
+      >>> mdp = gridworld(4).mdp
+      >>> host_graph(mdp) is host_graph(mdp), int(host_graph(mdp).num_entries.sum())
+      (True, 240)
+    """
+    remembered = vars(mdp).get(_MEMORY)
+    if remembered is not None:
+        return remembered
+    if checks.is_traced(mdp.next_state, mdp.probability, mdp.allowed):
+        raise ValueError(
+            "the graph of a model is searched on the host: call this outside jit, vmap and grad, "
+            "or close over the model there and trace what it is given beside"
+        )
+    return vars(mdp).setdefault(_MEMORY, HostGraph(mdp))
+
+
 def reachable_within(mdp: MDP, steps: int) -> scipy.sparse.csr_array:
     """Boolean [S, S] matrix whose row s marks s^steps, the states within `steps` steps of s (s included).
 
     As many entries as there are such pairs of states: with a hub at most S + S^2 of them from two steps on.
     """
-    return HostGraph(mdp).reach(np.arange(mdp.num_states), steps)
+    return host_graph(mdp).reach(np.arange(mdp.num_states), steps)
 
 
 def steps_from(mdp: MDP, state: int) -> np.ndarray:
     """Least number of steps by any actions from a state to every state, float [S]; infinite where none leads."""
-    return scipy.sparse.csgraph.dijkstra(HostGraph(mdp).adjacency, indices=state, unweighted=True)
+    return scipy.sparse.csgraph.dijkstra(host_graph(mdp).adjacency, indices=state, unweighted=True)

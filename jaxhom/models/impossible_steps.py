@@ -33,7 +33,7 @@ def report_impossible(mdp: MDP, demonstrations, impossible: str) -> None:
     if impossible == "ignore":
         return
     steps = known_steps(demonstrations)
-    bad = ~_is_possible(mdp, steps)
+    bad = ~mdp.dynamics.leads(steps.state, steps.action, steps.successor)
     if not bad.any():
         return
     trajectory, time, state, action, successor = (int(column[bad.argmax()]) for column in steps)
@@ -60,18 +60,3 @@ def known_steps(demonstrations) -> Steps:
     trajectory, time = np.nonzero(mask & (follows >= 0))
     at = trajectory, time
     return Steps(trajectory, time, states[at], actions[at], follows[at])
-
-
-def _is_possible(mdp: MDP, steps: Steps) -> np.ndarray:
-    """bool [P]: T(s, a, s') > 0; looked up among the successors of the pairs that occur, each once."""
-    probability = np.asarray(mdp.probability)
-    if mdp.is_dense:
-        return probability[steps.state, steps.action, steps.successor] > 0
-    pairs, row = np.unique(steps.state.astype(np.int64) * mdp.num_actions + steps.action, return_inverse=True)
-    width = probability.shape[-1]
-    listed = probability.reshape(-1, width)[pairs] > 0
-    successors = np.asarray(mdp.next_state).reshape(-1, width)[pairs].astype(np.int64)
-    edges = (np.arange(len(pairs))[:, None] * mdp.num_states + successors)[listed]  # ascending, as successors are
-    wanted = row * mdp.num_states + steps.successor
-    place = np.minimum(np.searchsorted(edges, wanted), len(edges) - 1)
-    return edges[place] == wanted

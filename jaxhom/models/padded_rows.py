@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxhom.status import Record
 
-_MAX_UNROLL = 16
+_MAX_UNROLL = 16  # terms that are written out; longer sums are loops over blocks of so many
+MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one: programs would take minutes to compile
 
 
 class PaddedRows(Record):

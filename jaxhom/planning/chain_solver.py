@@ -1,7 +1,7 @@
 """Linear systems of a policy's chain, in JAX: for programs, for batches, and for models whose graph fills up.
 
 With P_pi(s, s') = sum_a pi(s, a) T(s, a, s') these are x = b + gamma P_pi x (values) and its transpose (flows). Small
-models are solved by dense LU. Larger ones by BiCGSTAB on the products with P_pi (see `policy_chain`), followed, where
+models are solved by dense LU. Larger ones by BiCGSTAB on the products with P_pi (`Dynamics.chain`), followed, where
 Krylov stops short, by some plain sweeps x <- b + gamma P x, which always contract.
 
 Both can fail where the discount is near 1: Krylov on graphs that mix slowly, and LU in the digits that float32 has. So
@@ -22,8 +22,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxhom.models.mdp import MDP, expected_next_value, push_forward, state_transition
-from jaxhom.models.policy_chain import policy_chain
+from jaxhom.models.mdp import MDP, state_transition
 
 _MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
 _MAX_LU_STATES_DENSE = 256  # ... and products with the dense tensor
@@ -51,7 +50,8 @@ def solve_chain(
     """
 
     def solve(policy, source):
-        forward, backward = _products(mdp, policy)
+        chain = mdp.dynamics.chain(policy)
+        forward, backward = chain.push_forward, chain.expected_next_value
         product, transposed = (forward, backward) if transpose else (backward, forward)
 
         def solver(product, transpose):
@@ -80,7 +80,7 @@ def rough_state_occupancy(mdp: MDP, policy: jax.Array, residual: jax.Array) -> j
       mu [S, B]; NaN on lanes that missed the residual. Not to be differentiated.
     """
     initial = jnp.broadcast_to(mdp.initial[:, None], (mdp.num_states, policy.shape[2]))
-    forward, _ = _products(mdp, policy)
+    forward = mdp.dynamics.chain(policy).push_forward
     return _solve(mdp, policy, forward, initial, True, residual=residual)
 
 
@@ -108,31 +108,6 @@ def _some_lanes_at_a_time(solve: Callable, policy: jax.Array, source: jax.Array)
 
     solved = jax.lax.map(lambda batch: solve(*batch), (split(policy), split(source)))
     return jnp.moveaxis(solved, 0, 1).reshape(num_states, -1)[:, :lanes]
-
-
-def _products(mdp: MDP, policy: jax.Array) -> tuple[Callable, Callable]:
-    """The products with P_pi^T and P_pi."""
-    if not mdp.is_dense:
-        if policy.ndim == 3 and policy.shape[2] == 1:  # gathers of single numbers, not of rows of one
-            return tuple(_on_one_lane(product) for product in _products(mdp, policy[..., 0]))
-        chain = policy_chain(mdp.edges, mdp.probability, policy)
-        return chain.push_forward, chain.expected_next_value
-    if policy.ndim == 2:
-        transition = state_transition(mdp, policy)
-        return lambda mu: mu @ transition, lambda value: transition @ value
-
-    # One matrix for all lanes: its product is worth more than the A times fewer numbers of a matrix per lane.
-    def forward(mu):
-        return push_forward(mdp, mu[:, None] * policy)
-
-    def backward(value):
-        return jnp.einsum("sab,sab->sb", policy, expected_next_value(mdp, value))
-
-    return forward, backward
-
-
-def _on_one_lane(product: Callable) -> Callable:
-    return lambda x: product(x[:, 0])[:, None]
 
 
 def _solve(mdp: MDP, policy, product: Callable, b, transpose: bool, is_quick=False, residual=0.0) -> jax.Array:

@@ -59,14 +59,7 @@ class HostModel:
         pairs = self.num_states * self.num_actions
         probability = np.asarray(mdp.probability, np.float64).reshape(pairs, -1)
         probability = probability / _or_one(probability.sum(axis=1))[:, None]
-        if mdp.is_dense:
-            self.rows = probability
-            return
-        is_entry = probability > 0
-        counts = np.append(0, is_entry.sum(axis=1))
-        successors = np.asarray(mdp.next_state).reshape(pairs, -1)[is_entry]
-        entries = (probability[is_entry], successors, np.cumsum(counts))
-        self.rows = scipy.sparse.csr_array(entries, shape=(pairs, self.num_states))
+        self.rows = mdp.dynamics.host_matrix(probability.reshape(mdp.probability.shape))
 
     def expected_next_value(self, value: np.ndarray) -> np.ndarray:
         """E[value(s') | s, a], [S] -> [S, A]."""

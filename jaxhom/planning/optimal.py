@@ -24,8 +24,8 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.inputs import as_model, check_reward_values
-from jaxhom.models.mdp import MDP, expected_next_value, expected_next_values, uniform_policy
-from jaxhom.models.policy_chain import action_chains, saves_gathers
+from jaxhom.models.mdp import MDP, expected_next_value, uniform_policy
+from jaxhom.models.padded_rows import MAX_UNROLLED_ACTIONS
 from jaxhom.planning import policy_iteration
 from jaxhom.planning.chain_solver import solve_chain
 from jaxhom.planning.host_chains import host_model, is_at_hand
@@ -37,7 +37,6 @@ _STALL = 16.0  # a span of this many roundings of the largest value is taken for
 _LOOK_BACK = 8  # blocks after which a span that has not fallen to `_SLOW` of what it was counts as slow
 _SLOW = 0.5
 _MAX_IMPROVEMENTS = 100  # of policy iteration inside a program
-_MAX_UNROLLED_ACTIONS = 16
 _POLISHED_STATES = 20_000
 _VISIBLE = 0.01  # of the values: where rounding may have made more than that, float32 has no answer
 
@@ -379,14 +378,9 @@ def _sweeps(mdp: MDP, reward: jax.Array) -> tuple[Callable, ...]:
     and where some states have many more successors than most.
     """
     rewards = jax.lax.optimization_barrier(jnp.moveaxis(reward, 1, 0))  # each action's in one piece
-    is_wide = mdp.num_actions > _MAX_UNROLLED_ACTIONS  # what is written out for every action would compile for minutes
-    if is_wide:
-        chains, expected = None, None
-    elif mdp.is_dense or not saves_gathers(mdp.edges, mdp.narrow_width):
-        chains, expected = None, functools.partial(expected_next_values, mdp)
-    else:
-        chains = action_chains(mdp.edges, mdp.probability)
-        expected = chains.expected_next_values
+    is_wide = mdp.num_actions > MAX_UNROLLED_ACTIONS  # what is written out for every action would compile for minutes
+    chains = None if is_wide else mdp.dynamics.action_chains()
+    expected = (chains or mdp.dynamics).expected_next_values
 
     def backups(value):
         return [r + mdp.discount * v for r, v in zip(rewards, expected(value), strict=True)]

@@ -87,7 +87,7 @@ def evaluate_exactly(
 
     Example:
       >>> from jaxhom.domains.gridworld import gridworld
-      >>> from jaxhom.planning import optimal_policy
+      >>> from jaxhom.planning.optimal import optimal_policy
       >>> mdp = gridworld(4, noise=0.0).mdp
       >>> reward = jnp.zeros((16, 4)).at[:, 1].set(1.0)  # for the wish to go down
       >>> float(evaluate_exactly(mdp, optimal_policy(mdp, reward).policy, reward, 10).total_reward)

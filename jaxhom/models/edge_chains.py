@@ -10,10 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.models.padded_rows import PaddedRows, gather_sum, pad_rows, sum_rows
+from jaxhom.models.padded_rows import MAX_UNROLLED_ACTIONS, PaddedRows, gather_sum, pad_rows, sum_rows
 from jaxhom.status import Record
-
-_MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one
 
 
 class Edges(Record):
@@ -48,6 +46,20 @@ class PolicyChain(Record):
     def push_forward(self, occupancy: jax.Array) -> jax.Array:
         """P_pi^T mu, [S] -> [S] or [S, B] -> [S, B]."""
         return sum_rows(self.predecessor, self.predecessor_weight, occupancy)
+
+
+class OneLane(Record):
+    """The chain of one policy for arrays whose trailing axis is a batch of one."""
+
+    chain: PolicyChain
+
+    def expected_next_value(self, value: jax.Array) -> jax.Array:
+        """P_pi v, [S, 1] -> [S, 1]."""
+        return self.chain.expected_next_value(value[:, 0])[:, None]
+
+    def push_forward(self, occupancy: jax.Array) -> jax.Array:
+        """P_pi^T mu, [S, 1] -> [S, 1]."""
+        return self.chain.push_forward(occupancy[:, 0])[:, None]
 
 
 class ActionChains(Record):
@@ -102,7 +114,7 @@ def policy_chain(edges: Edges, probability: jax.Array, policy: jax.Array) -> Pol
     """The chain of a policy [S, A], or of a batch that comes last, [S, A, B], for probabilities [S, A, N]."""
     entries = jnp.append(probability.ravel(), jnp.zeros((), probability.dtype))  # the sentinel's 0
     batch = policy.shape[2:]
-    if policy.shape[1] > _MAX_UNROLLED_ACTIONS:
+    if policy.shape[1] > MAX_UNROLLED_ACTIONS:
         weight = jnp.einsum("ea...,ea->e...", policy[edges.source], entries[edges.entry])
     else:
         weight = sum(

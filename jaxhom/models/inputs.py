@@ -120,15 +120,3 @@ def check_reward_values(
     if mdp.restricts_actions and reward.shape[-2:] == (mdp.num_states, mdp.num_actions):
         reward = jnp.where(mdp.allowed, reward, forbidden)
     return reward
-
-
-def check_coordinates(mdp: MDP, coordinates) -> np.ndarray:
-    """Positions of the states, [S, D], as finite floats on the host.
-
-    Raises:
-      ValueError: on another shape, or naming the first entry that is not finite.
-    """
-    coordinates = checks.as_host_array("coordinates", coordinates)
-    good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
-    checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
-    return checks.require_floats("coordinates", coordinates)

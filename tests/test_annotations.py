@@ -13,9 +13,6 @@ from jaxhom import interop, plotting
 
 DOORS = (jaxhom, interop, plotting)
 NOT_YET = {  # public functions that wait for their annotations; nothing is added here
-    "jaxhom.MDP.dtype",
-    "jaxhom.MDP.from_dense",
-    "jaxhom.MDP.from_successors",
     "jaxhom.MDP.replace",
     "jaxhom.Demonstrations.from_trajectories",
     "jaxhom.Demonstrations.replace",

@@ -101,7 +101,7 @@ def evaluate_exactly(
         _batch_last(reward),
         terminal,
         events,
-        horizon=_require_count("horizon", horizon, 1),
+        horizon=checks.require_count("horizon", horizon),
         count_terminal_step=bool(count_terminal_step),
     )
 
@@ -150,8 +150,8 @@ def evaluate_by_sampling(
     """
     mdp = as_model(mdp)
     policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
-    horizon = _require_count("horizon", horizon, 1)
-    num_trials = _require_count("num_trials", num_trials, 2)
+    horizon = checks.require_count("horizon", horizon)
+    num_trials = checks.require_count("num_trials", num_trials, least=2)
 
     def evaluate(policy, reward):
         # One state more than steps: the last step of a trial may be the one that finishes it.
@@ -289,14 +289,3 @@ def _validated(mdp: MDP, policy, reward, terminal, events):
     for name, event in events.items():
         checks.require_shape(f"events[{name!r}]", event, str(pair), event.shape == pair)
     return check_policy(mdp, policy), reward, terminal, events
-
-
-def _require_count(name: str, count, least: int) -> int:
-    """Returns `count` as an int of at least `least`, or raises."""
-    try:
-        count = operator.index(count)
-    except TypeError:
-        raise ValueError(f"{name} must be a whole number, got {count!r}") from None
-    if count < least:
-        raise ValueError(f"{name} must be at least {least}, got {count}")
-    return count

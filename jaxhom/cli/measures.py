@@ -69,7 +69,7 @@ def measure(problem: Problem, policies: Mapping[str, Any], trial: int) -> list[M
         value = policy_value(mdp, *_stacked(problem, policies)) @ mdp.initial
         loss = problem.plan.upper_bound(mdp) @ mdp.initial - value
         numbers = {"value": value, "loss <=": loss, **numbers}
-    return [Measures(name, _lane(numbers, lane)) for lane, name in enumerate(policies)]
+    return [Measures(name, _at(numbers, i)) for i, name in enumerate(policies)]
 
 
 def measure_by_sampling(
@@ -81,7 +81,7 @@ def measure_by_sampling(
     result = evaluate_by_sampling(key, problem.mdp, *arrays, trial, num_trials=num_trials, **_endings(problem))
     errors = {} if result.standard_error is None else _numbers(problem, result.standard_error)
     numbers = _numbers(problem, result)
-    return [Measures(name, _lane(numbers, lane), _lane(errors, lane)) for lane, name in enumerate(policies)]
+    return [Measures(name, _at(numbers, i), _at(errors, i)) for i, name in enumerate(policies)]
 
 
 def agreements(problem: Problem, policies: Mapping[str, Any], references: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -129,5 +129,5 @@ def _numbers(problem: Problem, result: Evaluation) -> dict:
     return numbers
 
 
-def _lane(numbers: dict, lane: int) -> dict[str, float]:
-    return {name: float(array[lane]) for name, array in numbers.items()}
+def _at(numbers: Mapping[str, Any], i: int) -> dict[str, float]:
+    return {name: float(array[i]) for name, array in numbers.items()}

@@ -14,7 +14,7 @@ from jaxhom.status import Status
 
 
 def worst_status(*answers: Any) -> Status | None:
-    """The worst status among answers and their lanes; None if no answer has one."""
+    """The worst status among answers, batches of them included; None if no answer has one."""
     codes = _codes(answers)
     return Status(int(codes.max())) if codes.size else None
 
@@ -50,6 +50,6 @@ def warn(lines: list[str]) -> None:
 
 
 def _codes(answers: tuple[Any, ...]) -> np.ndarray:
-    """The statuses of answers, lane by lane."""
+    """The statuses of answers, one after the other."""
     statuses = (getattr(answer, "status", None) for answer in answers)
     return np.array([code for status in statuses if status is not None for code in np.ravel(status)], int)

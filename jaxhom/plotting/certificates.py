@@ -1,7 +1,7 @@
 """Pictures of certificates: how bounds close over iterations.
 
-The solvers report their last bounds alone, and these hold whenever one stops: a history is had by stopping at more and
-more iterations, for LPAL
+The solvers report their last bounds alone, and these hold whenever one stops: stop at more and more
+iterations to get a history, for LPAL
 
     history = [(n, s.margin, s.margin_bound) for n in (1, 2, 4, 8) for s in [lpal(mdp, expectations, max_iterations=n)]]
 

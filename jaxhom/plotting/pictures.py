@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Float
 
 _DECADES = 4  # of an occupancy that are told apart
-_SPREAD = 0.4  # width of the lane, in cells, that several trajectories share
+_SPREAD = 0.4  # cells from the first to the last of several trajectories that run side by side
 
 
 def plot_gridworld(

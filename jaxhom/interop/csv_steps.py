@@ -50,6 +50,18 @@ def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) 
 
     Raises:
       FileError: if the file is missing or no text, lacks a column, or has a wrong field (naming line and column).
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "walks.csv")
+      >>> _ = path.write_text("episode,state,action\\nmonday,0,1\\nmonday,1,1\\nmonday,2,\\n")
+      >>> demonstrations, report = demonstrations_from_csv(path)
+      >>> demonstrations.states.tolist(), demonstrations.final_states.tolist()
+      ([[0, 1]], [2])
+      >>> print(report)
+      1 episodes, 2 steps; 1 final observations
     """
     limits = (LARGEST_INDEX,) * 2 if mdp is None else (mdp.num_states, mdp.num_actions)
     lines: dict[str, list[_Line]] = {}

@@ -30,6 +30,13 @@ def make_environment(name: str, **options: Any) -> gymnasium.Env:
       ValueError: if there is no such environment, it lacks an option, one that is on or off is given something else
         (a text would count as on, whatever it says), or it refuses the options.
       ImportError: if Gymnasium is not installed.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> env = make_environment("FrozenLake-v1", is_slippery=False)
+      >>> [int(outcome[1]) for outcome in env.unwrapped.P[0][1]]  # from state 0, by action 1: down
+      [4]
     """
     try:
         import gymnasium

@@ -81,6 +81,8 @@ def from_gymnasium(
         (`require_steps_of_table`); and as `MDP.from_successors`.
       ImportError: for an id, if Gymnasium is not installed.
 
+    Outside jit, vmap and grad only: the table is read on the host.
+
     Example:
       >>> lake = from_gymnasium("FrozenLake-v1", discount=0.99)
       >>> lake.mdp.num_states, lake.mdp.num_actions, int(lake.terminal.sum())

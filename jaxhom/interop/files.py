@@ -55,6 +55,15 @@ def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None =
     Raises:
       FileError: if the file is missing, truncated, of another kind, or holds invalid values, or if there are two
         discounts.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "rooms.npz")
+      >>> np.savez(path, transition=np.full((2, 1, 2), 0.5), discount=0.9)
+      >>> load_mdp(path).num_states
+      2
     """
     arrays = _read(path)
     options = {name: arrays[name] for name in ("initial", "features", "allowed") if name in arrays}
@@ -81,6 +90,15 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
 
     Raises:
       FileError: as `load_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "walks.npz")
+      >>> np.savez(path, states=[[0, 1, 1], [0, 2, 0]], actions=[[1, 1, 0], [1, 0, 0]], length=[2, 3])
+      >>> load_demonstrations(path).mask.tolist()
+      [[True, True, False], [True, True, True]]
     """
     arrays = _read(path)
     _require(path, arrays, "states", "actions")
@@ -106,6 +124,15 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
 
     Raises:
       FileError: if the file is missing, truncated or of another kind.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "model.npz")
+      >>> np.savez(path, reward=[0.0, 1.0])
+      >>> load_arrays(path, "reward", "terminal")
+      {'reward': array([0., 1.])}
     """
     arrays = _read(path)
     return {name: arrays[name] for name in names if name in arrays}
@@ -116,6 +143,15 @@ def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
 
     Raises:
       FileError: as `load_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "policy.npz")
+      >>> np.savez(path, policy=[[0.5, 0.5], [1.0, 0.0]])
+      >>> load_policy(path).tolist()
+      [[0.5, 0.5], [1.0, 0.0]]
     """
     arrays = _read(path)
     _require(path, arrays, "policy")
@@ -130,6 +166,15 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
 
     Raises:
       OSError: if the file cannot be written.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "grid.npz")
+      >>> save_mdp(path, jaxhom.gridworld(3).mdp)
+      >>> load_mdp(path).num_states
+      9
     """
     layout = {"transition": np.asarray(mdp.probability)} if mdp.is_dense else _fields(mdp, "next_state", "probability")
     allowed = _fields(mdp, "allowed") if mdp.restricts_actions else {}
@@ -142,6 +187,15 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     Raises:
       ValueError: if `mask` is not a prefix of every row, or leaves one empty.
       OSError: as `save_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "walks.npz")
+      >>> save_demonstrations(path, Demonstrations.from_trajectories([([0, 1], [1, 1])]))
+      >>> load_demonstrations(path).states.tolist()
+      [[0, 1]]
     """
     mask = np.asarray(demonstrations.mask)
     length = mask.sum(axis=1)
@@ -158,6 +212,15 @@ def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extr
     Raises:
       ValueError: if `policy` is none, or an extra has a reserved name or is no plain array.
       OSError: as `save_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "policy.npz")
+      >>> save_policy(path, [[0.5, 0.5], [1.0, 0.0]], margin=0.25)
+      >>> load_arrays(path, "margin")["margin"].tolist()
+      0.25
     """
     checked = _validated_policy(checks.as_host_array("policy", policy))
     arrays = {name: checks.as_host_array(name, array) for name, array in extras.items()}

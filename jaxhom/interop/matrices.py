@@ -47,6 +47,14 @@ def from_mdptoolbox(
     Raises:
       ValueError: on a wrong shape, naming action, state and next state of the first entry that is not finite or
         negative, or action and state of the first row that does not sum to 1; and as `MDP.from_successors`.
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> stay, change = [[1.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]
+      >>> mdp = from_mdptoolbox([stay, change], discount=0.9)
+      >>> mdp.transition[0].tolist()  # of state 0, one row per action
+      [[1.0, 0.0], [0.0, 1.0]]
     """
     if scipy.sparse.issparse(transitions):
         raise ValueError(
@@ -119,6 +127,14 @@ def from_scipy(
     Raises:
       ValueError: on a matrix that is not sparse or has another shape, naming row and column of the first entry that is
         not finite or negative, or the first row that does not sum to 1; and as `MDP.from_successors`.
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> rows = scipy.sparse.csr_array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.0, 1.0]])
+      >>> mdp = from_scipy(rows, discount=0.9)
+      >>> mdp.num_states, mdp.num_actions
+      (2, 2)
     """
     if not scipy.sparse.issparse(matrix):
         raise ValueError(f"matrix must be a SciPy sparse matrix, got {type(matrix).__name__}")

@@ -98,6 +98,10 @@ def from_samples(
       ValueError: on sequences of different lengths or none at all, naming the first entry that is out of range or not
         whole, on a negative or infinite `prior` or an unknown `support`; and as `MDP.from_successors`.
 
+    Outside jit, vmap and grad only: transitions are counted on the host.
+
+    Source: the beta distribution's moments, Gelman et al., Bayesian Data Analysis, 3rd ed., appendix A.
+
     Example:
       >>> model = from_samples([0, 0, 0], [0, 0, 0], [1, 1, 0], num_states=2, num_actions=1, discount=0.9, prior=1.0)
       >>> model.mdp.transition[0].tolist(), model.count[:, 0].tolist()  # (2 + 1) / (3 + 2) of the mass goes to state 1

@@ -53,6 +53,16 @@ def demonstrations_from_episodes(
       ValueError: if there is no episode; something is not an episode, or several episodes in a row (transitions, with
         an end in between); nothing tells (states, actions) from two steps (state, action); or none can be used (with
         the first reason).
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> demonstrations, report = demonstrations_from_episodes([([0, 1, 2], [1, 1]), ([0], [])])
+      >>> demonstrations.states.tolist(), demonstrations.final_states.tolist()
+      ([[0, 1]], [2])
+      >>> print(report)
+      1 episodes, 2 steps; 1 final observations
+      episode 1 dropped: it has no actions
     """
     if _is_one(episodes):
         raise ValueError(
@@ -97,6 +107,13 @@ def demonstrations_from_steps(
 
     Raises:
       ValueError: if the arrays differ in length, there is no step, or no episode can be used.
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> demonstrations, report = demonstrations_from_steps(["a", "a", "b"], [0, 1, 0], [1, 1, 0])
+      >>> demonstrations.num_trajectories, report.steps
+      (2, 3)
     """
     names = checks.as_host_array("episode", episode)
     checks.require_shape("episode", names, "[T] with T >= 1", names.ndim == 1 and names.size > 0)
@@ -144,6 +161,13 @@ def demonstrations_from_transitions(
 
     Raises:
       ValueError: if the arrays differ in length, there is no step, flags are none, or no episode can be used.
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> demonstrations, _ = demonstrations_from_transitions([0, 1, 0], [1, 1, 0], [1, 2, 0], [False, True, False])
+      >>> demonstrations.num_trajectories, demonstrations.terminated.tolist()
+      (2, [True, False])
     """
     given = {"observations": observations, "next_observations": next_observations, "actions": actions}
     arrays = {name: checks.as_host_array(name, array) for name, array in given.items()}

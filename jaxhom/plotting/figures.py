@@ -65,6 +65,18 @@ def learned_policy_figure(
 
     Raises:
       ValueError: if a shape does not fit, or there is no policy for the racetrack.
+
+    Outside jit, vmap and grad only: trials are sampled and drawn on the host.
+
+    Example:
+      >>> import jaxhom
+      >>> world, track = jaxhom.gridworld(4), jaxhom.racetrack(["XXXX", "S..F", "XXXX"])
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1], [3, 3])])
+      >>> drive = jaxhom.Demonstrations.from_trajectories([([12, 38], [4, 4])])
+      >>> uniform = {name: np.full((domain.mdp.num_states, actions), 1 / actions)
+      ...     for name, domain, actions in (("world", world, 4), ("track", track, 5))}
+      >>> figure = learned_policy_figure(world, np.arange(16.0), walk, uniform["world"], track, drive,
+      ...     {"uniform": uniform["track"]}, key=jax.random.key(0))
     """
     if not racetrack_policies:
         raise ValueError("racetrack_policies must name at least one policy")

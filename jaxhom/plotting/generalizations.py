@@ -72,6 +72,15 @@ def plot_radius(
 
     Raises:
       ValueError: if the shape does not fit the domain, an entry is below -1 or not whole, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
+      >>> general = jaxhom.nearest_neighbors(world, walk)
+      >>> ax = plot_radius(world, general.radius)
     """
     board = board_of(domain)
     radius = require("radius", radius, (board.num_states,))
@@ -103,6 +112,15 @@ def plot_support(
 
     Raises:
       ValueError: if a shape does not fit the domain, an entry is negative or not whole, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
+      >>> general = jaxhom.nearest_neighbors(world, walk)
+      >>> ax = plot_support(world, general.support, visited=general.visited)
     """
     board = board_of(domain)
     support = require("support", support, (board.num_states,))
@@ -142,6 +160,16 @@ def plot_generalization(
 
     Raises:
       ValueError: if a shape does not fit the domain, there is no such speed, or `ax` is not three axes.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
+      >>> general = jaxhom.nearest_neighbors(world, walk)
+      >>> [panel.get_title(loc="left") for panel in plot_generalization(world, general)]
+      ['radius', 'support', 'policy']
     """
     board = board_of(domain)
     mosaic = speed is None and board.per_cell > 1

@@ -41,6 +41,13 @@ def plot_policy_by_state(
 
     Raises:
       ValueError: if a shape does not fit.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> plot_policy_by_state(np.full((5, 2), 0.5), visited=np.arange(5) < 2).get_ylabel()
+      'action'
     """
     policy = checks.as_host_array("policy", policy)
     checks.require_shape("policy", policy, "[S, A]", policy.ndim == 2 and policy.size > 0)
@@ -77,6 +84,12 @@ def plot_occupancy_by_state(
 
     Raises:
       ValueError: if the shape does not fit, or no state is visited.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> plot_occupancy_by_state([3.0, 1.0, 0.1]).get_yscale()
+      'log'
     """
     occupancy = checks.as_host_array("occupancy", occupancy)
     checks.require_shape("occupancy", occupancy, "[S] or [S, A]", occupancy.ndim in (1, 2) and occupancy.size > 0)
@@ -101,6 +114,14 @@ def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None 
 
     Returns:
       The axes.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 5], [3, 1, 1])])
+      >>> plot_trajectories_by_state(walk).get_xlabel()
+      'step'
     """
     ax = _axes(ax, height=3.2)
     for states in unpadded(trajectories):
@@ -125,6 +146,12 @@ def plot_radius_counts(radius: Int[ArrayLike, "S"], *, ax: Axes | None = None) -
 
     Raises:
       ValueError: if the shape does not fit, or an entry is below -1 or not whole.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> [int(bar.get_height()) for bar in plot_radius_counts([0, 0, 1, 2, 2, -1]).patches]  # from -1 on
+      [1, 2, 1, 2]
     """
     radius = checks.as_host_array("radius", radius)
     checks.require_shape("radius", radius, "[S]", radius.ndim == 1 and radius.size > 0)

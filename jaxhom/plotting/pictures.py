@@ -58,6 +58,14 @@ def plot_gridworld(
 
     Raises:
       ValueError: if a shape does not fit the gridworld.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4, num_regions=4)
+      >>> plot_gridworld(world, values=np.arange(16.0), label="number").get_xlabel()
+      'column'
     """
     board = board_of(gridworld, Gridworld)
     if values is not None:
@@ -94,6 +102,14 @@ def plot_racetrack(
 
     Raises:
       ValueError: if a shape does not fit the racetrack, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> track = jaxhom.racetrack(["XXXX", "S..F", "XXXX"])
+      >>> plot_racetrack(track, values=np.arange(4.0)).get_ylabel()
+      'row'
     """
     board = board_of(racetrack, Racetrack)
     if values is not None:
@@ -129,6 +145,14 @@ def plot_policy(
 
     Raises:
       ValueError: if a shape does not fit the domain, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> ax = plot_policy(world, np.full((16, 4), 0.25))
+      >>> ax.figure.savefig("/dev/null", format="png")
     """
     board = board_of(domain)
     policy = policy_at(board, policy, speed)
@@ -163,6 +187,14 @@ def plot_trajectories(
 
     Raises:
       ValueError: if a state does not exist in the domain.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 5], [3, 1, 1])])
+      >>> len(plot_trajectories(jaxhom.gridworld(4), walk).lines)
+      1
     """
     board = board_of(domain)
     trajectories.validate(board.mdp, "ignore")
@@ -205,6 +237,15 @@ def plot_occupancy(
 
     Raises:
       ValueError: if the shape does not fit the domain, or no open cell is visited.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> visits = jaxhom.occupancy(world, np.full((16, 4), 0.25))
+      >>> plot_occupancy(world, visits).get_ylabel()
+      'row'
     """
     board = board_of(domain)
     shape = (board.num_states,)

@@ -13,7 +13,7 @@ from typing import Any, NoReturn, TextIO
 
 INTERRUPTED = 130
 _AGAIN = 3.0  # seconds after which an interruption that somebody swallowed is raised again
-_SOON = 0.02
+_SOON = 0.02  # seconds until what could not be raised is raised again
 _happened = False
 
 

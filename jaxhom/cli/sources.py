@@ -35,10 +35,10 @@ from jaxhom.models.inputs import check_coordinates, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
 from jaxhom.planning.optimal import Plan, optimal_policy
 
-_DISCOUNT = 0.99
+_DISCOUNT = 0.99  # as the domains of the library
 _TRACK_STEPS = 20  # of a demonstration on a racetrack, and of a trial below, as in the paper
 _TRACK_TRIAL = 30
-_STEPS = 100
+_STEPS = 100  # of either, where the source has no limit
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

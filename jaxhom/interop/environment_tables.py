@@ -127,7 +127,7 @@ def require_steps_of_table(env: gymnasium.Env, num_steps: int = 200) -> None:
     Args:
       env: the environment. Nothing is checked if it has no table, its observations are no states, or it cannot be
         stepped.
-      num_steps: how many.
+      num_steps: how many: some episodes of a small environment, in a few milliseconds.
 
     Raises:
       ValueError: naming the first state, action and next state that the table gives no probability.

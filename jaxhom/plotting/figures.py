@@ -24,7 +24,7 @@ from jaxhom.plotting.pictures import plot_gridworld, plot_racetrack, plot_trajec
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Float, Key
 
-_STRIP_WIDTH = 5.2  # inches
+_STRIP_WIDTH = 5.2  # inches, where the title of a strip finds room
 _NUM_TRIALS = 99  # of which the figure shows the median one
 
 

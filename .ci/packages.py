@@ -40,7 +40,7 @@ def check_source(path: pathlib.Path, folder: pathlib.Path) -> None:
         archive.extractall(folder, filter="data")
     (root,) = folder.iterdir()
     environment = {**os.environ, "PYTHONPATH": str(root)}
-    collected = run([sys.executable, "-m", "pytest", "--collect-only", "-q", "-n", "0"], root, environment)
+    collected = run([sys.executable, "-m", "pytest", "--collect-only", "-n", "0"], root, environment)
     print(f"{path.name}: {collected.count('::')} tests are collected")
 
 

@@ -26,7 +26,7 @@ _shortened.maxstring = _shortened.maxother = _LONGEST
 
 
 class Status(enum.IntEnum):
-    """How a lane ended. Bounds are valid whatever the status."""
+    """How a lane, one problem of a batch or the only one, ended. Bounds are valid whatever the status."""
 
     SOLVED = 0
     ITERATION_LIMIT = 1

@@ -18,7 +18,8 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport, with_report
-from jaxhom.models.demonstrations import Demonstrations, require_no_steps
+from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.trajectories import require_no_steps
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Int, Shaped

@@ -4,12 +4,17 @@ Demonstrations of another map, or whose states are numbered from 1, mostly lie w
 a bad policy without a sign. What gives them away is the dynamics: T(s_t, a_t, s_{t+1}) = 0.
 """
 
+from __future__ import annotations
+
 import warnings
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jaxhom.models.mdp import MDP
+
+if TYPE_CHECKING:
+    from jaxtyping import Int
 
 OPTIONS = ("refuse", "warn", "ignore")
 
@@ -19,16 +24,16 @@ class ImpossibleStepsWarning(UserWarning):
 
 
 class Steps(NamedTuple):
-    """P steps whose successor is known, each [P]: where they are and s, a, s'."""
+    """P steps whose successor is known: where they are and s, a, s'."""
 
-    trajectory: np.ndarray
-    time: np.ndarray
-    state: np.ndarray
-    action: np.ndarray
-    successor: np.ndarray
+    trajectory: Int[np.ndarray, " P"]
+    time: Int[np.ndarray, " P"]
+    state: Int[np.ndarray, " P"]
+    action: Int[np.ndarray, " P"]
+    successor: Int[np.ndarray, " P"]
 
 
-def report_impossible(mdp: MDP, demonstrations, impossible: str) -> None:
+def report_impossible(mdp: MDP, demonstrations: Any, impossible: str) -> None:
     """Raises `ValueError` ("refuse") or warns ("warn") if steps have probability 0, saying how many and the first."""
     if impossible == "ignore":
         return
@@ -47,7 +52,7 @@ def report_impossible(mdp: MDP, demonstrations, impossible: str) -> None:
     warnings.warn(message, ImpossibleStepsWarning, stacklevel=4)
 
 
-def known_steps(demonstrations) -> Steps:
+def known_steps(demonstrations: Any) -> Steps:
     """The steps that are followed by one that the mask shows too, or by a final state that is known."""
     horizon = demonstrations.horizon
     fields = demonstrations.states, demonstrations.actions, demonstrations.mask

@@ -60,7 +60,8 @@ def with_report(
         if not dropped:
             raise ValueError("there are no episodes")
         raise ValueError(f"none of {len(dropped)} episodes can be used; episode {dropped[0][0]}: {dropped[0][1]}")
-    demonstrations = Demonstrations.from_trajectories(kept, terminated=terminated)
+    ended = None if terminated is None else np.array(terminated)
+    demonstrations = Demonstrations.from_trajectories(kept, terminated=ended)
     steps = sum(len(actions) for _, actions in kept)
     report = ImportReport(
         episodes=len(kept), steps=steps, final_observations=final_observations, dropped=tuple(dropped)

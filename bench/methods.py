@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
+from jaxhom.similarity.homomorphism import ClassSimilarity
 
 import jaxhom
 from bench.problems import Problem, build_domain
 from bench.settings import Setting
 from jaxhom import MDP, Status
-from jaxhom.similarity.homomorphism import ClassSimilarity
 from jaxhom.similarity.local_models import LocalModelClasses, local_model_classes
 
 _SIMILARITY_TOLERANCE = 1e-4

@@ -16,13 +16,13 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from jaxhom.similarity.homomorphism import ClassSimilarity  # noqa: E402
 
 import jaxhom  # noqa: E402
 from bench import peers  # noqa: E402
 from bench.speed_rows import commit, print_row, versions  # noqa: E402
 from jaxhom.generalization.global_lp import GlobalHomomorphismProblem  # noqa: E402
 from jaxhom.similarity.brackets import bracket_errors  # noqa: E402
-from jaxhom.similarity.homomorphism import ClassSimilarity  # noqa: E402
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem  # noqa: E402
 from jaxhom.similarity.local_models import local_model_classes, restricted_model  # noqa: E402
 from jaxhom.solvers import pdhg  # noqa: E402

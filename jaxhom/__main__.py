@@ -1,5 +1,6 @@
 """Entry point of `python -m jaxhom`."""
 
+import io
 import sys
 
 from jaxhom import interrupts
@@ -16,6 +17,7 @@ def _run() -> int:
 
 
 if __name__ == "__main__":
-    sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no reason to stop
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no reason to stop
     sys.stdout, sys.stderr = map(interrupts.UntilClosed, (sys.stdout, sys.stderr))
     interrupts.leave(_run())

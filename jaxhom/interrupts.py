@@ -9,10 +9,11 @@ import contextlib
 import os
 import signal
 import sys
+from typing import Any, NoReturn, TextIO
 
 INTERRUPTED = 130
 _AGAIN = 3.0  # seconds after which an interruption that somebody swallowed is raised again
-_SOON = 0.02
+_SOON = 0.02  # seconds until what could not be raised is raised again
 _happened = False
 
 
@@ -46,14 +47,14 @@ def rest() -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def say(*details) -> int:
+def say(*details: object) -> int:
     """Says in one line of stderr that the process was interrupted; the exit code for it."""
     rest()
     print("; ".join(["jaxhom: interrupted", *map(str, details)]), file=sys.stderr)
     return INTERRUPTED
 
 
-def leave(code: int) -> None:
+def leave(code: int) -> NoReturn:
     """Ends the process; at once if it was interrupted."""
     if signal.getsignal(signal.SIGINT) is _raise_once:  # everything is done and told
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -68,7 +69,7 @@ def leave(code: int) -> None:
 class UntilClosed:
     """A text stream that is written to until nobody reads it any more (`| head`), and never complains."""
 
-    def __init__(self, stream):
+    def __init__(self, stream: TextIO):
         self._stream = stream
 
     def write(self, text: str) -> int:
@@ -89,7 +90,7 @@ class UntilClosed:
         os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
         return written
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
 

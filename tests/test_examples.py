@@ -4,7 +4,10 @@ import doctest
 import importlib
 import pathlib
 
+import matplotlib.pyplot
 import pytest
+
+matplotlib.use("Agg")
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 MODULES = sorted(
@@ -17,4 +20,5 @@ MODULES = sorted(
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_print_what_they_say(name):
     failed, tried = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
+    matplotlib.pyplot.close("all")
     assert tried and not failed

@@ -1,11 +1,17 @@
 """`python -m jaxhom evaluate`: what saved policies achieve, exactly and in sampled trials."""
 
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
 import numpy as np
 
 from jaxhom.cli.measures import agreements, agreements_table, measure, measure_by_sampling, measures_table
 from jaxhom.cli.options import MODEL_HELP, add_command, add_model_options, count, positive
 from jaxhom.cli.results import write_json
 from jaxhom.cli.sources import load_policy_of, load_problem
+from jaxhom.cli.statuses import remarks, warn
 from jaxhom.cli.tables import format_table
 from jaxhom.planning.occupancy import feature_expectations
 
@@ -21,7 +27,7 @@ The optimal policy is shown beside them where a reward is known: that of an envi
 _MAX_FEATURES = 12  # that are printed
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Any) -> None:
     """Adds the command."""
     summary = "evaluate saved policies on a model, exactly and by sampling"
     parser = add_command(commands, "evaluate", run, summary=summary, epilog=_EXAMPLES + MODEL_HELP)
@@ -42,7 +48,7 @@ def add_parser(commands) -> None:
     group.add_argument("--output", metavar="FILE.json", help="also write the numbers there")
 
 
-def run(options) -> None:
+def run(options: argparse.Namespace) -> None:
     """Reads, evaluates and prints.
 
     Raises:
@@ -57,11 +63,13 @@ def run(options) -> None:
     others = {options.against: load_policy_of(problem, options.against)} if options.against else {}
     optimal = {} if problem.reward is None else {"optimal": problem.plan.policy}
     trial = options.steps or problem.trial
-    policies = {**optimal, **others, **saved}
-    report = {"model": problem.name, "discount": float(problem.mdp.discount), "steps_of_a_trial": trial}
+    policies: dict[str, Any] = {**optimal, **others, **saved}
+    report: dict[str, Any] = {"model": problem.name, "discount": float(problem.mdp.discount), "steps_of_a_trial": trial}
     exact = measure(problem, policies, trial)
     report["exact"] = [row.as_json() for row in exact]
     _print(f"exact, trials of at most {trial} steps", exact)
+    if optimal:
+        warn(remarks("optimal policy", problem.plan))
     if options.trials:
         sampled = measure_by_sampling(problem, policies, trial, options.trials, options.seed)
         report["sampled"] = [row.as_json() for row in sampled]

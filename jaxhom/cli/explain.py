@@ -1,10 +1,16 @@
 """`python -m jaxhom explain`: where a state's policy comes from."""
 
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
 import numpy as np
 
-from jaxhom.cli.methods import GENERALIZATIONS, check_method, generalize
-from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_method_options, add_model_options
+from jaxhom.cli.methods import GENERALIZATIONS, add_method_options, check_method, generalize
+from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_model_options
 from jaxhom.cli.sources import Problem, load_problem, load_trajectories
+from jaxhom.cli.statuses import remarks, warn
 from jaxhom.generalization.result import Generalization
 
 _EXAMPLES = """\
@@ -18,7 +24,7 @@ demonstrations and method are those that were learned from: nothing is stored of
 """
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Any) -> None:
     """Adds the command."""
     summary = "say where the policy of a state comes from: who voted, through which map, with what error"
     parser = add_command(commands, "explain", run, summary=summary, epilog=_EXAMPLES + MODEL_HELP)
@@ -28,7 +34,7 @@ def add_parser(commands) -> None:
     add_method_options(parser, GENERALIZATIONS)
 
 
-def run(options) -> None:
+def run(options: argparse.Namespace) -> None:
     """Reads, generalizes and prints.
 
     Raises:
@@ -41,6 +47,9 @@ def run(options) -> None:
     asked = np.isin(np.arange(problem.mdp.num_states), states)
     general, _ = generalize(problem, demonstrations, options, asked)
     print("\n\n".join(_explanation(problem, general, state) for state in states))
+    # What stayed undecided of a state is in its explanation.
+    sampled = remarks("optimal policy", problem.plan) if options.expert else []
+    warn(sampled + remarks("generalization", general))
 
 
 def _explanation(problem: Problem, general: Generalization, state: int) -> str:

@@ -4,15 +4,19 @@ Stages follow each other, and each writes what it found before the next begins: 
 policy, LPAL's, pictures. An interruption loses the stage that is under way and nothing else.
 """
 
+from __future__ import annotations
+
+import argparse
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 
 from jaxhom import interrupts
 from jaxhom.apprenticeship.lpal import lpal
 from jaxhom.cli import pictures, results
-from jaxhom.cli.methods import METHODS, check_method, generalize, wants_progress
-from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_method_options, add_model_options
+from jaxhom.cli.methods import METHODS, add_method_options, check_method, generalize, wants_progress
+from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_model_options
 from jaxhom.cli.report import Report
 from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem, load_problem, load_trajectories
@@ -40,10 +44,10 @@ demonstrations in .csv files: one step a line, the first line names the columns 
 _LPAL_METHODS = ("auto", "columns", "interior_point", "flow")
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Any) -> None:
     """Adds the command."""
-    formats = files.__doc__.partition("\n\n")[2].partition("\n\nAnything")[0]
-    layout = results.__doc__.partition("\n\n")[2].rstrip()
+    formats = str(files.__doc__).partition("\n\n")[2].partition("\n\nAnything")[0]
+    layout = str(results.__doc__).partition("\n\n")[2].rstrip()
     epilog = _EXAMPLES + MODEL_HELP + "\n" + _OUTPUT.format(layout, formats)
     summary = "learn a policy for every state of a model from demonstrations"
     parser = add_command(commands, "learn", run, summary=summary, epilog=epilog)
@@ -71,7 +75,7 @@ def add_parser(commands) -> None:
     group.add_argument("--no-pictures", action="store_true", help="write none")
 
 
-def run(options) -> None:
+def run(options: argparse.Namespace) -> None:
     """Reads, learns, prints and writes.
 
     Raises:
@@ -96,7 +100,9 @@ def _learn(problem: Problem, demonstrations, origin: str, options, output: Resul
     output.demonstrations(demonstrations)
     visited, _ = empirical_policy(problem.mdp, demonstrations)
     report = Report(problem, demonstrations, origin, visited, options, output)
-    title, general, policy, known, policies = METHODS[options.method].title, None, None, {"visited": visited}, {}
+    title, general, policy = METHODS[options.method].title, None, None
+    known: dict[str, Any] = {"visited": visited}
+    policies: dict[str, Any] = {}
     if METHODS[options.method].function:
         with report.timed("seconds_generalizing"):
             general, numbers = generalize(problem, demonstrations, options)

@@ -9,9 +9,13 @@ demonstrations' length (Boularias and Chaib-draa 2010, section VI). What is cert
 * `LPAL gap`: margin_bound - margin of the LPAL solution, per step: no policy has a margin larger by more.
 """
 
+from __future__ import annotations
+
+import argparse
 import dataclasses
 import sys
 from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,33 +23,30 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom.apprenticeship.lpal import lpal
-from jaxhom.cli.methods import wants_progress
+from jaxhom.cli.methods import METHODS, run_method, wants_progress
 from jaxhom.cli.options import Parser, count, positive
 from jaxhom.cli.pictures import load_plotting
 from jaxhom.cli.results import save_figure
+from jaxhom.cli.sources import Problem, racetrack_problem
+from jaxhom.cli.statuses import remarks, warn
 from jaxhom.cli.tables import GrowingTable
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
-from jaxhom.domains.racetrack import Racetrack, racetrack
-from jaxhom.generalization.algorithm1 import soft_local_homomorphism
-from jaxhom.generalization.neighbors import nearest_neighbors
-from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.domains.racetrack import Racetrack
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
-from jaxhom.models.mdp import MDP
 from jaxhom.planning.occupancy import feature_expectations, policy_value
 from jaxhom.planning.optimal import Plan, optimal_policy
 from jaxhom.planning.trials import evaluate_exactly
 from jaxhom.status import at_most
 
-GENERALIZATIONS: dict[str, Callable] = {
-    "soft local homomorphism": soft_local_homomorphism,
-    "k-NN (hops)": nearest_neighbors,
-    "maximum entropy": uniform_elsewhere,
-}
 EXPERT = "expert"
-METHODS = (EXPERT, *GENERALIZATIONS, "soft local homomorphism + LPAL")
-_GRID_TRIAL = 50
-_TRACK_DEMONSTRATION = 20
-_TRACK_TRIAL = 30
+APPRENTICE = "soft-local-homomorphism"  # whose policies LPAL starts from
+GENERALIZATIONS: dict[str, dict[str, Any]] = {
+    APPRENTICE: {},
+    "nearest-neighbors": {"metric": "hops"},
+    "maximum-entropy": {},
+}
+"""Which methods the table compares, with which options."""
+_GRID_TRIAL = 50  # steps, as in the paper
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Row:
     def cells(self) -> tuple[str, ...]:
         """The row of the printed table."""
 
-        def show(value, pattern=None):
+        def show(value: float, pattern: str | None = None) -> str:
             return "" if np.isnan(value) else format(value, pattern) if pattern else at_most(value)
 
         return (
@@ -82,15 +83,22 @@ HEADER = ("method", "reward/step", "% of expert", "steps", "off-roads/step", "lo
 
 @dataclasses.dataclass(frozen=True)
 class _Setting:
-    """One block of the table: a model, the true rewards [B, S, A] and the expert's plans of its B sets."""
+    """One block of the table: a problem, and of its B sets the true rewards [B, S, A] and the expert's plans."""
 
-    mdp: MDP
+    problem: Problem
+    domain: Any
     reward: jax.Array
     expert: Plan
     demonstrations: list[Demonstrations]
-    trial: int
-    terminal: jax.Array | None
-    off_road: jax.Array | None
+
+
+class _Policies(NamedTuple):
+    """One method's policies [B, S, A], LPAL's certified gaps [B] (NaN elsewhere), and what they were read from."""
+
+    name: str
+    policy: jax.Array
+    gap: jax.Array
+    answers: list[Any]
 
 
 def add_options(parser: Parser) -> None:
@@ -110,7 +118,7 @@ def add_options(parser: Parser) -> None:
     parser.add_argument("--progress", action="store_true", help="show progress also where stderr is no terminal")
 
 
-def run(options) -> None:
+def run(options: argparse.Namespace) -> None:
     """Runs the job and prints its table, a row as soon as it is known; saves a picture where matplotlib is installed.
 
     Args:
@@ -121,28 +129,31 @@ def run(options) -> None:
       ValueError: if there is no such gridworld or racetrack.
     """
     grid_key, track_key, picture_key = jax.random.split(jax.random.key(options.seed), 3)
-    settings = _settings(grid_key, track_key, options)
     titles = _titles(options)
-    table = GrowingTable(HEADER, max(map(len, [*titles, *(f"  {name}" for name in METHODS)])))
-    drawn: dict[type, tuple] = {}
+    drawn: dict[type, tuple[_Setting, dict[str, jax.Array]]] = {}
+    told: list[str] = []
+    table = GrowingTable(HEADER, max(map(len, [*titles, *(f"  {name}" for name in _names())])))
     total = len(titles) * options.sets * (len(GENERALIZATIONS) + 1)
     with tqdm(total=total, unit="policy", leave=False, disable=not wants_progress(options)) as bar:
-        for title, (setting, domain) in zip(titles, settings, strict=True):
+        for title, setting in zip(titles, _settings(grid_key, track_key, options), strict=True):
             bar.set_description(title)
             _say(table.rule() if drawn else table.header())
             _say(table.line((title,) + ("",) * (len(HEADER) - 1)))
             measure = _measurer(setting)
             policies = {}
-            for name, policy, gap in _learn(setting, bar.update):
-                _say(table.line(measure(name, policy, gap).cells()))
-                policies[name] = policy[0]
-            drawn.setdefault(type(domain), (domain, setting, policies))
+            for found in _learn(setting, bar.update):
+                _say(table.line(measure(found).cells()))
+                policies[found.name] = found.policy[0]
+                told += remarks(f"{title}, {found.name}", *found.answers)
+            drawn.setdefault(type(setting.domain), (setting, policies))
+    track_trial = drawn[Racetrack][0].problem.trial
     print(
         f"\nMeans over {options.sets} sets of demonstrations; exact evaluation in trials of the demonstrations' length"
     )
-    print(f"(gridworld {_GRID_TRIAL}) or {_TRACK_TRIAL} steps (racetrack). `loss <=` and `LPAL gap` are per step.")
+    print(f"(gridworld {_GRID_TRIAL}) or {track_trial} steps (racetrack). `loss <=` and `LPAL gap` are per step.")
+    warn(told)
     if options.picture and len(drawn) == 2:
-        _draw(picture_key, options.picture, drawn)
+        _draw(picture_key, options.picture, drawn[Gridworld], drawn[Racetrack])
 
 
 def _say(line: str) -> None:
@@ -151,109 +162,124 @@ def _say(line: str) -> None:
     sys.stdout.flush()
 
 
-def _titles(options) -> list[str]:
+def _titles(options: argparse.Namespace) -> list[str]:
     """Of the blocks, in the order of `_settings`."""
     grid = [f"gridworld {options.grid}x{options.grid}, {options.regions} regions, 10 demonstrations"]
     track = [f"racetrack ({options.track}), {number} demonstrations" for number in options.demonstrations]
     return grid * bool(options.grid) + track
 
 
-def _settings(grid_key, track_key, options) -> Iterator[tuple[_Setting, Gridworld | Racetrack]]:
+def _names() -> list[str]:
+    """Of the rows of a block."""
+    return [EXPERT, *map(_name, GENERALIZATIONS), f"{_name(APPRENTICE)} + LPAL"]
+
+
+def _name(method: str) -> str:
+    """A method as it is called in the table: with its options."""
+    options = ", ".join(GENERALIZATIONS[method].values())
+    return METHODS[method].title + (f" ({options})" if options else "")
+
+
+def _settings(grid_key: jax.Array, track_key: jax.Array, options: argparse.Namespace) -> Iterator[_Setting]:
     """The blocks of the table, one by one."""
-    size, regions, sets = options.grid, options.regions, options.sets
-    if size:
-        world = gridworld(size, num_regions=regions)
-        draw_key, sample_key = jax.random.split(grid_key)
-        weights = jax.vmap(lambda k: sample_weights(k, regions))(jax.random.split(draw_key, sets))
-        reward = jnp.einsum("sak,bk->bsa", world.mdp.features, weights.astype(world.mdp.dtype))
-        expert = optimal_policy(world.mdp, reward)
-        keys = jax.random.split(sample_key, sets)
-        samples = [
-            sample_demonstrations(k, world.mdp, policy, 10, _GRID_TRIAL)
-            for k, policy in zip(keys, expert.policy, strict=True)
-        ]
-        yield _Setting(world.mdp, reward, expert, samples, _GRID_TRIAL, None, None), world
-    track = racetrack(options.track)
-    plan = optimal_policy(track.mdp, track.mdp.features @ track.weights)
-    reward = jnp.broadcast_to(track.mdp.features @ track.weights, (sets, *plan.policy.shape))
-    expert = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (sets, *leaf.shape)), plan)
+    if options.grid:
+        yield _gridworld_setting(grid_key, options.grid, options.regions, options.sets)
+    problem = racetrack_problem(options.track)
+    plan = problem.plan
+    reward = jnp.broadcast_to(jnp.asarray(problem.reward), (options.sets, *plan.policy.shape))
+    expert = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (options.sets, *leaf.shape)), plan)
     for number in options.demonstrations:
-        keys = jax.random.split(jax.random.fold_in(track_key, number), sets)
-        samples = [sample_demonstrations(k, track.mdp, plan.policy, number, _TRACK_DEMONSTRATION) for k in keys]
-        yield _Setting(track.mdp, reward, expert, samples, _TRACK_TRIAL, track.terminal, track.off_road), track
+        keys = jax.random.split(jax.random.fold_in(track_key, number), options.sets)
+        samples = [sample_demonstrations(k, problem.mdp, plan.policy, number, problem.demonstration) for k in keys]
+        yield _Setting(problem, problem.domain, reward, expert, samples)
 
 
-def _learn(setting: _Setting, progress: Callable[[int], object]) -> Iterator[tuple[str, jax.Array, jax.Array]]:
-    """Each method's name, its policies [B, S, A] and, for LPAL, the certified gaps [B] (NaN elsewhere)."""
-    mdp, samples = setting.mdp, setting.demonstrations
+def _gridworld_setting(key: jax.Array, size: int, regions: int, sets: int) -> _Setting:
+    """The gridworld, with a reward of its own for every set."""
+    world = gridworld(size, num_regions=regions)
+    draw_key, sample_key = jax.random.split(key)
+    weights = jax.vmap(lambda k: sample_weights(k, regions))(jax.random.split(draw_key, sets))
+    reward = jnp.einsum("sak,bk->bsa", world.mdp.features, weights.astype(world.mdp.dtype))
+    expert = optimal_policy(world.mdp, reward)
+    keys = jax.random.split(sample_key, sets)
+    samples = [
+        sample_demonstrations(k, world.mdp, policy, 10, _GRID_TRIAL)
+        for k, policy in zip(keys, expert.policy, strict=True)
+    ]
+    return _Setting(Problem("gridworld", world.mdp, trial=_GRID_TRIAL), world, reward, expert, samples)
+
+
+def _learn(setting: _Setting, progress: Callable[[int], object]) -> Iterator[_Policies]:
+    """What each method makes of the demonstrations."""
+    problem, samples = setting.problem, setting.demonstrations
     no_gap = jnp.full(len(samples), jnp.nan)
-    yield EXPERT, setting.expert.policy, no_gap
-    for name, generalize in GENERALIZATIONS.items():
-        policies = []
+    yield _Policies(EXPERT, setting.expert.policy, no_gap, [setting.expert])
+    for method, options in GENERALIZATIONS.items():
+        found = []
         for demonstrations in samples:
-            policies.append(generalize(mdp, demonstrations).policy)
+            found.append(run_method(method, problem, demonstrations, **options)[0])
             progress(1)
-        policies = jnp.stack(policies)
-        yield name, policies, no_gap
-        if generalize is soft_local_homomorphism:
-            yield f"{name} + LPAL", *_apprentice(mdp, feature_expectations(mdp, policies), policies)
+        policies = jnp.stack([general.policy for general in found])
+        yield _Policies(_name(method), policies, no_gap, found)
+        if method == APPRENTICE:
+            yield _apprentices(setting, _name(method), policies)
             progress(len(samples))
 
 
-def _apprentice(mdp: MDP, expectations, initial_policy) -> tuple[jax.Array, jax.Array]:
-    """LPAL's policies and its certified gaps per step."""
-    solution = lpal(mdp, expectations, initial_policy=initial_policy)
+def _apprentices(setting: _Setting, name: str, policies: jax.Array) -> _Policies:
+    """LPAL's policies, started from given ones."""
+    mdp = setting.problem.mdp
+    solution = lpal(mdp, feature_expectations(mdp, policies), initial_policy=policies)
     gap = jnp.maximum(solution.margin_bound - solution.margin, 0.0)
-    return solution.policy, gap * (1.0 - mdp.discount)
+    return _Policies(f"{name} + LPAL", solution.policy, gap * (1.0 - mdp.discount), [solution])
 
 
-def _measurer(setting: _Setting) -> Callable[[str, jax.Array, jax.Array], Row]:
+def _measurer(setting: _Setting) -> Callable[[_Policies], Row]:
     """What makes the rows of a block: means over the sets of a method's policies and gaps."""
-    mdp = setting.mdp
+    problem, mdp = setting.problem, setting.problem.mdp
     best = setting.expert.upper_bound(mdp) @ mdp.initial
-    events = {} if setting.off_road is None else {"off_road": setting.off_road}
+    endings = {"terminal": problem.terminal, "events": problem.events}
 
     def evaluate(policy):
-        return evaluate_exactly(mdp, policy, setting.reward, setting.trial, terminal=setting.terminal, events=events)
+        return evaluate_exactly(mdp, policy, setting.reward, problem.trial, **endings)
 
     expert_reward = evaluate(setting.expert.policy).reward_per_step
 
-    def measure(name: str, policy: jax.Array, gap: jax.Array) -> Row:
-        result = evaluate(policy)
-        loss = best - policy_value(mdp, policy, setting.reward) @ mdp.initial
+    def measure(found: _Policies) -> Row:
+        result = evaluate(found.policy)
+        loss = best - policy_value(mdp, found.policy, setting.reward) @ mdp.initial
         return Row(
-            method=f"  {name}",
+            method=f"  {found.name}",
             reward_per_step=float(result.reward_per_step.mean()),
             relative=float((result.reward_per_step / expert_reward).mean()),
-            steps=float(result.steps.mean()) if setting.terminal is not None else np.nan,
-            off_roads=float(result.events["off_road"].mean()) if events else np.nan,
+            steps=float(result.steps.mean()) if problem.terminal is not None else np.nan,
+            off_roads=float(result.events["off_road"].mean()) if problem.events else np.nan,
             loss_bound=float((loss * (1.0 - mdp.discount)).mean()),
-            lpal_gap=float(gap.max()),
+            lpal_gap=float(found.gap.max()),
         )
 
     return measure
 
 
-def _draw(key, path: str, policies: dict) -> None:
+def _draw(key: jax.Array, path: str, grid: tuple[_Setting, dict], track: tuple[_Setting, dict]) -> None:
     """Saves the picture of the first block of each domain."""
     try:
         plotting = load_plotting()
     except ImportError as error:
         print(f"No picture: {error}")
         return
-    world, grid_setting, grid_policies = policies[Gridworld]
-    track, track_setting, track_policies = policies[Racetrack]
-    shown = ("expert", "k-NN (hops)", "soft local homomorphism")
+    (world, world_policies), (road, road_policies) = grid, track
+    shown = (EXPERT, _name("nearest-neighbors"), _name(APPRENTICE))
     figure = plotting.learned_policy_figure(
-        world,
-        grid_setting.reward[0],
-        grid_setting.demonstrations[0],
-        grid_policies["soft local homomorphism"],
-        track,
-        track_setting.demonstrations[0],
-        {name: track_policies[name] for name in shown},
+        world.domain,
+        world.reward[0],
+        world.demonstrations[0],
+        world_policies[_name(APPRENTICE)],
+        road.domain,
+        road.demonstrations[0],
+        {name: road_policies[name] for name in shown},
         key=key,
-        horizon=_TRACK_TRIAL,
+        horizon=road.problem.trial,
     )
     save_figure(path, figure)
     print(f"Picture of the learned policies: {path}")

@@ -11,7 +11,11 @@
 The first two, `loss <=` among them, need a reward.
 """
 
+from __future__ import annotations
+
 import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +45,7 @@ class Measures:
     numbers: dict[str, float]
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
 
-    def cells(self, columns) -> list[str]:
+    def cells(self, columns: Sequence[str]) -> list[str]:
         """A row of a table."""
         return [self.policy, *(self._cell(name) for name in columns)]
 
@@ -51,11 +55,12 @@ class Measures:
         text = _FORMATS.get(name, _SHARE)(self.numbers[name])
         return f"{text} ±{self.errors[name]:.1g}" if name in self.errors else text
 
-    def as_json(self) -> dict:
+    def as_json(self) -> dict[str, Any]:
+        """The numbers by name."""
         return {"policy": self.policy, **self.numbers, **{f"{k} standard error": v for k, v in self.errors.items()}}
 
 
-def measure(problem: Problem, policies: dict, trial: int) -> list[Measures]:
+def measure(problem: Problem, policies: Mapping[str, Any], trial: int) -> list[Measures]:
     """Exact measures of named policies [S, A]."""
     result = evaluate_exactly(problem.mdp, *_stacked(problem, policies), trial, **_endings(problem))
     numbers = _numbers(problem, result)
@@ -64,43 +69,46 @@ def measure(problem: Problem, policies: dict, trial: int) -> list[Measures]:
         value = policy_value(mdp, *_stacked(problem, policies)) @ mdp.initial
         loss = problem.plan.upper_bound(mdp) @ mdp.initial - value
         numbers = {"value": value, "loss <=": loss, **numbers}
-    return [Measures(name, _lane(numbers, lane)) for lane, name in enumerate(policies)]
+    return [Measures(name, _at(numbers, i)) for i, name in enumerate(policies)]
 
 
-def measure_by_sampling(problem: Problem, policies: dict, trial: int, num_trials: int, seed: int) -> list[Measures]:
+def measure_by_sampling(
+    problem: Problem, policies: Mapping[str, Any], trial: int, num_trials: int, seed: int
+) -> list[Measures]:
     """The measures of trials, from samples with their standard errors."""
     key = jax.random.key(seed)
     arrays = _stacked(problem, policies)
     result = evaluate_by_sampling(key, problem.mdp, *arrays, trial, num_trials=num_trials, **_endings(problem))
-    numbers, errors = _numbers(problem, result), _numbers(problem, result.standard_error)
-    return [Measures(name, _lane(numbers, lane), _lane(errors, lane)) for lane, name in enumerate(policies)]
+    errors = {} if result.standard_error is None else _numbers(problem, result.standard_error)
+    numbers = _numbers(problem, result)
+    return [Measures(name, _at(numbers, i), _at(errors, i)) for i, name in enumerate(policies)]
 
 
-def agreements(problem: Problem, policies: dict, references: dict) -> list[dict]:
+def agreements(problem: Problem, policies: Mapping[str, Any], references: Mapping[str, Any]) -> list[dict[str, Any]]:
     """How often policies take the action of references: over all states that matter, and over those they meet."""
-    matters = np.ones(problem.mdp.num_states) if problem.terminal is None else 1.0 - problem.terminal
+    matters: Any = np.ones(problem.mdp.num_states) if problem.terminal is None else 1.0 - problem.terminal
     rows = []
     for name, policy in policies.items():
         for other, reference in references.items():
-            met = np.asarray(occupancy(problem.mdp, reference).sum(axis=-1)) * matters
+            met: Any = np.asarray(occupancy(problem.mdp, reference).sum(axis=-1)) * matters
             everywhere, there = (float(agreement(problem.mdp, policy, reference, w)) for w in (matters, met))
             rows.append({"policy": name, "reference": other, "all states": everywhere, "where that goes": there})
     return rows
 
 
-def agreements_table(rows: list[dict]) -> str:
+def agreements_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """All of them below each other."""
     cells = [[row["policy"], row["reference"], *(f"{row[name]:.3f}" for name in _SHARES)] for row in rows]
     return format_table(("policy", "as", *_SHARES), cells)
 
 
-def measures_table(rows: list[Measures]) -> str:
+def measures_table(rows: Sequence[Measures]) -> str:
     """All of them below each other."""
     columns = list(dict.fromkeys(name for row in rows for name in row.numbers))
     return format_table(("policy", *columns), [row.cells(columns) for row in rows])
 
 
-def _stacked(problem: Problem, policies: dict) -> tuple[jax.Array, jax.Array]:
+def _stacked(problem: Problem, policies: Mapping[str, Any]) -> tuple[jax.Array, jax.Array]:
     """Policies [B, S, A] and the reward, zero where it is not known."""
     shape = (problem.mdp.num_states, problem.mdp.num_actions)
     reward = jnp.zeros(shape, problem.mdp.dtype) if problem.reward is None else problem.reward
@@ -121,5 +129,5 @@ def _numbers(problem: Problem, result: Evaluation) -> dict:
     return numbers
 
 
-def _lane(numbers: dict, lane: int) -> dict[str, float]:
-    return {name: float(array[lane]) for name, array in numbers.items()}
+def _at(numbers: Mapping[str, Any], i: int) -> dict[str, float]:
+    return {name: float(array[i]) for name, array in numbers.items()}

@@ -1,19 +1,38 @@
-"""The methods that the command line offers, and the options that belong to each."""
+"""The methods that the command line offers: one table of their names, what runs them, and the options of each.
 
+`learn`, `explain` and the main job read it. A method takes a problem, demonstrations, whether to show progress, the
+states that a policy is wanted for, and its own options; it returns a generalization and numbers of its making.
+"""
+
+from __future__ import annotations
+
+import argparse
 import dataclasses
 import sys
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from jaxhom.cli.options import Parser, positive
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
 from jaxhom.generalization.neighbors import nearest_neighbors
 from jaxhom.generalization.regression import occupancy_regression
 from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.similarity.table import SimilarityTable
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool
 
-def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, **settings):
+    from jaxhom.cli.sources import Problem
+
+Found = tuple[Generalization, dict[str, Any]]
+
+
+def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, **settings) -> Found:
     if problem.terminal is not None:  # no action matters there, and their local models can be large
         states = ~problem.terminal if states is None else states & ~problem.terminal
     table = SimilarityTable(problem.mdp, distance=settings.get("distance", 1), anchored=not printed)
@@ -22,20 +41,20 @@ def _local(problem, demonstrations, progress, states, *, printed=False, mutual=F
     return found, {"classes_of_local_models": table.num_classes, "pairs_of_classes_solved": table.num_solved}
 
 
-def _global(problem, demonstrations, progress, _, *, printed=False, **settings):
+def _global(problem, demonstrations, progress, _, *, printed=False, **settings) -> Found:
     found = soft_homomorphism(problem.mdp, demonstrations, anchored=not printed, progress=progress, **settings)
-    return found, {"error_lower": float(found.error_lower), "error_upper": float(found.error_upper)}
+    return found, {name: float(np.asarray(getattr(found, name))) for name in ("error_lower", "error_upper")}
 
 
-def _nearest(problem, demonstrations, *_, **settings):
+def _nearest(problem, demonstrations, *_, **settings) -> Found:
     return nearest_neighbors(problem.mdp, demonstrations, coordinates=problem.coordinates, **settings), {}
 
 
-def _uniform(problem, demonstrations, *_):
+def _uniform(problem, demonstrations, *_) -> Found:
     return uniform_elsewhere(problem.mdp, demonstrations), {}
 
 
-def _regression(problem, demonstrations, *_):
+def _regression(problem, demonstrations, *_) -> Found:
     try:
         return occupancy_regression(problem.mdp, demonstrations, problem.coordinates), {}
     except RuntimeError as error:  # no solver found an optimum
@@ -47,7 +66,7 @@ class Method:
     """A method's name in tables, what runs it, and its options; without a function it generalizes nothing."""
 
     title: str
-    function: Callable | None
+    function: Callable[..., Found] | None
     options: tuple[str, ...] = ()
 
 
@@ -65,29 +84,60 @@ METHODS = {
 
 GENERALIZATIONS = tuple(name for name, method in METHODS.items() if method.function)
 
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "distance": {"type": positive, "metavar": "D", "help": "radius d of the local models (default 1)"},
+    "threshold": {"type": float, "metavar": "E", "help": "largest error epsilon of a similarity (default 0)"},
+    "mutual": {"action": "store_true", "help": "require similarity in both directions"},
+    "printed": {"action": "store_true", "help": "homomorphisms as the paper prints them, without the anchor"},
+    "tolerance": {
+        "type": float,
+        "metavar": "T",
+        "help": "of the homomorphism's linear programs (default 1e-4 local, 1e-3 global)",
+    },
+    "max_iterations": {"type": positive, "metavar": "N", "help": "of the global program (default 20000)"},
+    "metric": {
+        "choices": ("hops", "euclidean"),
+        "help": "of the nearest neighbours (default hops: steps in the model)",
+    },
+}
+"""What `argparse` is told of every option in the table of methods, in the order of the help."""
 
-def wants_progress(options) -> bool:
+
+def add_method_options(parser: Parser, names: tuple[str, ...] = tuple(METHODS)) -> None:
+    """How the expert's policy is extended."""
+    group = parser.add_argument_group("method")
+    listed = ", ".join(names[1:])
+    group.add_argument(
+        "--method", choices=names, default=names[0], metavar="NAME", help=f"{names[0]} (default), {listed}"
+    )
+    for name, arguments in _OPTIONS.items():
+        group.add_argument(_flag(name), **arguments)
+    group.add_argument(
+        "--progress", action="store_true", help="show progress and time left also where stderr is no terminal"
+    )
+
+
+def wants_progress(options: argparse.Namespace) -> bool:
     """On a terminal, or where it was asked for."""
     return options.progress or sys.stderr.isatty()
 
 
-def settings_of(options) -> dict:
+def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     """The method's options that were given.
 
     Raises:
       ValueError: if one belongs to another method.
     """
-    known = sorted({name for method in METHODS.values() for name in method.options})
-    values = {name: getattr(options, name) for name in known}
+    values = {name: getattr(options, name) for name in sorted(_OPTIONS)}
     given = {name: value for name, value in values.items() if value is not None and value is not False}
     for name in given:
         if name not in METHODS[options.method].options:
             owners = " and ".join(key for key, method in METHODS.items() if name in method.options)
-            raise ValueError(f"--{name.replace('_', '-')} belongs to {owners}; the method is {options.method}")
+            raise ValueError(f"{_flag(name)} belongs to {owners}; the method is {options.method}")
     return given
 
 
-def check_method(problem, options) -> None:
+def check_method(problem: Problem, options: argparse.Namespace) -> None:
     """Raises `ValueError` on options that do not fit the method or the model, before anything is computed."""
     settings = settings_of(options)
     if not settings.get("threshold", 0.0) >= 0.0:
@@ -100,7 +150,12 @@ def check_method(problem, options) -> None:
             raise ValueError(f"{what} needs coordinates of the states, and {problem.name} has none")
 
 
-def generalize(problem, demonstrations, options, states=None) -> tuple[Generalization, dict]:
+def generalize(
+    problem: Problem,
+    demonstrations: Demonstrations,
+    options: argparse.Namespace,
+    states: Bool[np.ndarray, " S"] | None = None,
+) -> Found:
     """Runs the chosen method.
 
     Args:
@@ -112,5 +167,23 @@ def generalize(problem, demonstrations, options, states=None) -> tuple[Generaliz
     Returns:
       The generalization, and what else is known of its making: numbers by name.
     """
-    run = METHODS[options.method].function
-    return run(problem, demonstrations, wants_progress(options), states, **settings_of(options))
+    return run_method(options.method, problem, demonstrations, wants_progress(options), states, **settings_of(options))
+
+
+def run_method(
+    name: str,
+    problem: Problem,
+    demonstrations: Demonstrations,
+    progress: bool = False,
+    states: Bool[np.ndarray, " S"] | None = None,
+    **settings: Any,
+) -> Found:
+    """Runs a method of the table that generalizes; what it takes and returns the module says."""
+    function = METHODS[name].function
+    if function is None:
+        raise ValueError(f"the method {name} generalizes nothing")
+    return function(problem, demonstrations, progress, states, **settings)
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"

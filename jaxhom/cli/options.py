@@ -1,10 +1,12 @@
 """Options that several commands share, and the kinds of values that they take."""
 
+from __future__ import annotations
+
 import argparse
 import ast
 import json
-
-from jaxhom.cli.methods import METHODS
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 MODEL_HELP = """\
 models:
@@ -20,11 +22,13 @@ models:
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, like all others of the command line."""
 
-    def error(self, message: str):
+    def error(self, message: str) -> NoReturn:
         self.exit(2, f"jaxhom: error: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
-def add_command(commands, name: str, run, *, summary: str, epilog: str) -> Parser:
+def add_command(
+    commands: Any, name: str, run: Callable[[argparse.Namespace], None], *, summary: str, epilog: str
+) -> Parser:
     """A subcommand, whose epilog keeps its line breaks."""
     parser = commands.add_parser(
         name,
@@ -80,34 +84,6 @@ def add_demonstration_options(parser: Parser) -> None:
     )
 
 
-def add_method_options(parser: Parser, names: tuple[str, ...] = tuple(METHODS)) -> None:
-    """How the expert's policy is extended."""
-    group = parser.add_argument_group("method")
-    listed = ", ".join(names[1:])
-    group.add_argument(
-        "--method", choices=names, default=names[0], metavar="NAME", help=f"{names[0]} (default), {listed}"
-    )
-    group.add_argument("--distance", type=positive, metavar="D", help="radius d of the local models (default 1)")
-    group.add_argument("--threshold", type=float, metavar="E", help="largest error epsilon of a similarity (default 0)")
-    group.add_argument("--mutual", action="store_true", help="require similarity in both directions")
-    group.add_argument(
-        "--printed", action="store_true", help="homomorphisms as the paper prints them, without the anchor"
-    )
-    group.add_argument(
-        "--tolerance",
-        type=float,
-        metavar="T",
-        help="of the homomorphism's linear programs (default 1e-4 local, 1e-3 global)",
-    )
-    group.add_argument("--max-iterations", type=positive, metavar="N", help="of the global program (default 20000)")
-    group.add_argument(
-        "--metric", choices=("hops", "euclidean"), help="of the nearest neighbours (default hops: steps in the model)"
-    )
-    group.add_argument(
-        "--progress", action="store_true", help="show progress and time left also where stderr is no terminal"
-    )
-
-
 def positive(text: str) -> int:
     """A whole number from 1 on."""
     number = count(text)
@@ -132,13 +108,13 @@ def count(text: str) -> int:
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "none": None, "null": None}
 
 
-def environment_options(words: list[str]) -> dict:
+def environment_options(words: list[str]) -> dict[str, Any]:
     """`["is_slippery=false", "map_name=8x8"]` -> {"is_slippery": False, "map_name": "8x8"}.
 
     Raises:
       ValueError: if a word is no NAME=VALUE, a name comes twice, or a value begins like a list and is none.
     """
-    options = {}
+    options: dict[str, Any] = {}
     for word in words:
         name, equals, text = word.partition("=")
         if not equals or not name.isidentifier():

@@ -3,18 +3,27 @@
 matplotlib is imported by the functions alone: every other command works without it.
 """
 
+from __future__ import annotations
+
 import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxhom.cli.sources import Problem
 from jaxhom.domains.racetrack import Racetrack
+from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.planning.occupancy import occupancy
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool, Float
+    from matplotlib.figure import Figure
 
 KINDS = ("policy", "occupancy", "trajectories", "generalization")
 
 
-def load_plotting():
+def load_plotting() -> ModuleType:
     """`jaxhom.plotting`, for files rather than for a screen.
 
     Raises:
@@ -25,7 +34,12 @@ def load_plotting():
     return plotting
 
 
-def draw_policy(problem: Problem, policy, visited=None, speed=(0, 0)):
+def draw_policy(
+    problem: Problem,
+    policy: Float[ArrayLike, "S A"],
+    visited: Bool[ArrayLike, " S"] | None = None,
+    speed: tuple[int, int] = (0, 0),
+) -> Figure:
     """A figure of a policy [S, A]; on racetracks that of cars of one speed."""
     plotting = load_plotting()
     if problem.domain is None:
@@ -36,7 +50,7 @@ def draw_policy(problem: Problem, policy, visited=None, speed=(0, 0)):
     return ax.figure
 
 
-def draw_occupancy(problem: Problem, policy):
+def draw_occupancy(problem: Problem, policy: Any) -> Figure:
     """A figure of where a policy goes."""
     plotting = load_plotting()
     visits = occupancy(problem.mdp, policy)
@@ -45,7 +59,7 @@ def draw_occupancy(problem: Problem, policy):
     return plotting.plot_occupancy(problem.domain, visits).figure
 
 
-def draw_trajectories(problem: Problem, demonstrations):
+def draw_trajectories(problem: Problem, demonstrations: Demonstrations) -> Figure:
     """A figure of demonstrations."""
     plotting = load_plotting()
     if problem.domain is None:
@@ -53,7 +67,7 @@ def draw_trajectories(problem: Problem, demonstrations):
     return plotting.plot_trajectories(problem.domain, demonstrations).figure
 
 
-def draw_generalization(problem: Problem, general, speed=None):
+def draw_generalization(problem: Problem, general: Any, speed: tuple[int, int] | None = None) -> Figure:
     """A figure of how far advice came and from how many states; on racetracks for one speed, or all if None."""
     plotting = load_plotting()
     if problem.domain is None:

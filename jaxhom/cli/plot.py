@@ -1,6 +1,10 @@
 """`python -m jaxhom plot`: pictures of saved policies and demonstrations."""
 
+from __future__ import annotations
+
+import argparse
 import types
+from typing import Any
 
 from jaxhom import checks
 from jaxhom.cli import pictures
@@ -24,7 +28,7 @@ examples:
 """
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Any) -> None:
     """Adds the command."""
     summary = "draw a saved policy, its occupancy, how it was generalized, or trajectories"
     parser: Parser = add_command(commands, "plot", run, summary=summary, epilog=_EXAMPLES + MODEL_HELP)
@@ -42,7 +46,7 @@ def add_parser(commands) -> None:
     )
 
 
-def run(options) -> None:
+def run(options: argparse.Namespace) -> None:
     """Reads, draws and writes.
 
     Raises:

@@ -1,16 +1,28 @@
 """What `learn` tells: tables as soon as their numbers are there, and the same in report.json."""
 
+from __future__ import annotations
+
+import argparse
 import contextlib
 import time
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxhom.apprenticeship.lpal import LPALSolution
 from jaxhom.cli.measures import measure, measures_table
 from jaxhom.cli.methods import settings_of
 from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem
+from jaxhom.cli.statuses import in_words, remarks, undecided, warn, worst_status
 from jaxhom.cli.tables import format_facts
+from jaxhom.generalization.generalization import Generalization
+from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.status import Status, bracket
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Bool
 
 _MAX_RADII = 8  # that have a row each
 
@@ -27,7 +39,15 @@ class Report:
       results: where report.json goes.
     """
 
-    def __init__(self, problem: Problem, demonstrations, origin: str, visited, options, results: Results):
+    def __init__(
+        self,
+        problem: Problem,
+        demonstrations: Demonstrations,
+        origin: str,
+        visited: Bool[Array, " S"],
+        options: argparse.Namespace,
+        results: Results,
+    ):
         self._problem, self._results = problem, results
         mdp, terminal = problem.mdp, problem.terminal
         # Where an episode has ended no action matters, and such states are no part of the counts.
@@ -35,7 +55,7 @@ class Report:
         sizes = {"states": mdp.num_states, "actions": mdp.num_actions, "features": mdp.num_features}
         steps = int(np.asarray(demonstrations.mask).sum())
         count, num_visited = demonstrations.num_trajectories, int(np.asarray(visited).sum())
-        self.content = {
+        self.content: dict[str, Any] = {
             "finished": False,
             "options": {name: value for name, value in vars(options).items() if name not in ("run", "command")},
             "model": {"name": problem.name, **sizes, "discount": float(mdp.discount)},
@@ -51,7 +71,7 @@ class Report:
         rows += [("demonstrations", origin), ("trajectories, steps", f"{count}, {steps}")]
         self._tell("problem", [*rows, ("states demonstrated", _share(visited))])
 
-    def generalization(self, general, numbers: dict) -> None:
+    def generalization(self, general: Generalization, numbers: Mapping[str, Any]) -> None:
         """Where advice was found.
 
         Args:
@@ -69,6 +89,7 @@ class Report:
         if shown < len(levels):
             rows.append((f"  advice from radius {levels[shown]} to {levels[-1]}", str(counts[shown:].sum())))
         rows.append(("states without a vote (uniform policy)", _share(nothing)))
+        rows += self._how_it_ended(general)
         if "error_lower" in numbers:
             rows.append(("error of the map", bracket(numbers["error_lower"], numbers["error_upper"])))
         if "pairs_of_classes_solved" in numbers:
@@ -76,7 +97,16 @@ class Report:
             rows.append(("classes of local models, pairs of them solved", solved))
         self._tell("\ngeneralization", rows)
 
-    def lpal(self, solution) -> None:
+    def _how_it_ended(self, general: Generalization) -> list[tuple[str, str]]:
+        """What is said of a generalization that did not end as asked for."""
+        status, (pairs, states) = worst_status(general), undecided(general)
+        if status is not None:
+            counts = {"undecided_pairs": pairs, "undecided_states": states}
+            self.content["generalization"] |= {"status": status.name, **counts}
+        rows = [("pairs left undecided", in_words(pairs, states))] if pairs else []
+        return rows + ([("status", status.message)] if status else [])  # SOLVED is 0
+
+    def lpal(self, solution: LPALSolution) -> None:
         """LPAL's certificate."""
         margin, bound, status = float(solution.margin), float(solution.margin_bound), Status(int(solution.status))
         self.content["lpal"] = {
@@ -88,19 +118,21 @@ class Report:
         facts = [("margin", f"{margin:.6g}"), ("no policy's margin exceeds", f"{bound:.6g}")]
         self._tell("\nLPAL", [*facts, ("status", status.message)])
 
-    def values(self, policies: dict) -> None:
+    def values(self, policies: Mapping[str, Any]) -> None:
         """What named policies achieve, where a reward is known."""
         rows = measure(self._problem, policies, self._problem.trial)
         self.content["values"] = [row.as_json() for row in rows]
         self.content["steps_of_a_trial"] = self._problem.trial
+        self.content["status_of_the_optimal_policy"] = Status(int(self._problem.plan.status)).name
         self._results.report(self.content)
         print(f"\n{measures_table(rows)}")
         print(
             f"value: discounted, over all time; the rest: of trials of at most {self._problem.trial} steps", flush=True
         )
+        warn(remarks("optimal policy", self._problem.plan))
 
     @contextlib.contextmanager
-    def timed(self, name: str):
+    def timed(self, name: str) -> Iterator[None]:
         """Notes the seconds that a stage takes."""
         start = time.perf_counter()
         yield

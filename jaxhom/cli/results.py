@@ -7,12 +7,20 @@ OUTPUT/report.json           everything that is printed, and the settings
 OUTPUT/*.png                 pictures, if matplotlib is installed
 """
 
+from __future__ import annotations
+
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from jaxhom.interop.files import save_demonstrations, save_policy, whole_file
+from jaxhom.models.demonstrations import Demonstrations
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float
+    from matplotlib.figure import Figure
 
 _FILES = (".csv", ".json", ".npy", ".txt", ".png", ".svg", ".pdf", ".pkl", ".mat", ".h5", ".track", ".zip")
 
@@ -40,20 +48,23 @@ class Results:
         elif not os.path.isdir(os.path.dirname(path) or "."):
             raise FileNotFoundError(2, "no such folder", os.path.dirname(path))
 
-    def policy(self, policy, *, is_final: bool, **arrays) -> None:
+    def policy(self, policy: Float[ArrayLike, "S A"], *, is_final: bool, **arrays: Any) -> None:
         """Writes a policy and what is known of it; one that is not final makes way for the one that is."""
         name = "policy.npz" if is_final else "generalization.npz"
         path = os.path.join(self._path, name) if self.is_folder else self._path
         save_policy(path, policy, **arrays)
         self._note(path)
 
-    def demonstrations(self, demonstrations) -> None:
+    def demonstrations(self, demonstrations: Demonstrations) -> None:
+        """Writes what is learned from."""
         self._in_folder("demonstrations.npz", lambda path: save_demonstrations(path, demonstrations))
 
-    def report(self, report: dict) -> None:
+    def report(self, report: Mapping[str, Any]) -> None:
+        """Writes what is known so far."""
         self._in_folder("report.json", lambda path: write_json(path, report))
 
-    def picture(self, name: str, figure) -> None:
+    def picture(self, name: str, figure: Figure) -> None:
+        """Writes a figure, and forgets it."""
         self._in_folder(f"{name}.png", lambda path: save_figure(path, figure))
 
     def _in_folder(self, name: str, write: Callable[[str], None]) -> None:
@@ -67,7 +78,7 @@ class Results:
             self.written.append(path)
 
 
-def save_figure(path: str, figure) -> None:
+def save_figure(path: str, figure: Figure) -> None:
     """Writes a figure in the format that the name asks for, and forgets it.
 
     Raises:
@@ -85,7 +96,7 @@ def save_figure(path: str, figure) -> None:
         plt.close(figure)
 
 
-def write_json(path: str, content) -> None:
+def write_json(path: str, content: Any) -> None:
     """Writes JSON; NaN and infinity, which JSON has no word for, as null."""
     text = json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
     with whole_file(path) as file:

@@ -4,6 +4,9 @@ Whatever is wrong with a source is one `ValueError` that names it (and line, col
 is computed.
 """
 
+from __future__ import annotations
+
+import argparse
 import dataclasses
 import functools
 import os
@@ -20,20 +23,22 @@ from jaxhom.cli.options import environment_options
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.domains.track_maps import SHIPPED
+from jaxhom.interop.csv_steps import demonstrations_from_csv
+from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environment_maps import tile_map
-from jaxhom.interop.environments import from_gymnasium, make_environment, require_steps_of_table
+from jaxhom.interop.environment_tables import require_steps_of_table
+from jaxhom.interop.environments import from_gymnasium
 from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, load_mdp, load_policy
-from jaxhom.interop.trajectories import demonstrations_from_csv
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
 from jaxhom.models.inputs import check_coordinates, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
 from jaxhom.planning.optimal import Plan, optimal_policy
 
-_DISCOUNT = 0.99
+_DISCOUNT = 0.99  # as the domains of the library
 _TRACK_STEPS = 20  # of a demonstration on a racetrack, and of a trial below, as in the paper
 _TRACK_TRIAL = 30
-_STEPS = 100
+_STEPS = 100  # of either, where the source has no limit
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,7 +69,13 @@ class Problem:
 
     @functools.cached_property
     def plan(self) -> Plan:
-        """An optimal policy; for models with a reward."""
+        """An optimal policy.
+
+        Raises:
+          ValueError: if no reward is known.
+        """
+        if self.reward is None:
+            raise ValueError(f"{self.name} has no reward (array 'reward')")
         return optimal_policy(self.mdp, self.reward)
 
     @property
@@ -85,13 +96,14 @@ class Problem:
             if not 0 <= numbers[0] < self.mdp.num_states:
                 raise ValueError(f"state {text} must lie in [0, {self.mdp.num_states})")
             return numbers[0]
-        places = {Racetrack: (2, 4), TileMap: (2,)}.get(type(self.domain), ())
-        if len(numbers) not in places:
-            raise ValueError(f"state {text!r}: {self.name} numbers its states from 0 to {self.mdp.num_states - 1}")
-        return self.domain.state_of(numbers[:2], *([numbers[2:]] if numbers[2:] else []))
+        if isinstance(self.domain, Racetrack) and len(numbers) == 4:
+            return self.domain.state_of(numbers[:2], numbers[2:])
+        if self.domain is not None and len(numbers) == 2:
+            return self.domain.state_of(numbers)
+        raise ValueError(f"state {text!r}: {self.name} numbers its states from 0 to {self.mdp.num_states - 1}")
 
 
-def load_problem(options) -> Problem:
+def load_problem(options: argparse.Namespace) -> Problem:
     """The model of `--env` or `--mdp`.
 
     Raises:
@@ -109,13 +121,13 @@ def load_problem(options) -> Problem:
     if path not in SHIPPED and not os.path.exists(path):
         raise FileError(f"{path}: no such file")
     if path in SHIPPED or kind in (".track", ".txt"):
-        return _track(path, options.discount)
+        return racetrack_problem(path, options.discount)
     if kind == ".npz":
         return _archive(path, options.discount)
     raise FileError(f"{path}: models are .npz archives or .track maps; {' and '.join(SHIPPED)} come with the library")
 
 
-def _environment(options) -> Problem:
+def _environment(options: argparse.Namespace) -> Problem:
     name, *words = options.env
     arguments = environment_options(words)
     env = make_environment(name, **arguments)
@@ -123,7 +135,7 @@ def _environment(options) -> Problem:
         discount = _DISCOUNT if options.discount is None else options.discount
         model = from_gymnasium(env, discount=discount, end_state=options.end_state)
         require_steps_of_table(env)
-        domain, limit = tile_map(env, model.mdp), env.spec.max_episode_steps or _STEPS
+        domain, limit = tile_map(env, model.mdp), (env.spec and env.spec.max_episode_steps) or _STEPS
     except ValueError as error:
         raise ValueError(f"{name}: {str(error).replace('end_state=True', '--end-state')}") from None
     finally:
@@ -140,7 +152,13 @@ def _environment(options) -> Problem:
     )
 
 
-def _track(path: str, discount: float | None) -> Problem:
+def racetrack_problem(path: str, discount: float | None = None) -> Problem:
+    """A racetrack: one that comes with the library, or the file of a map; 0.99 if no discount is given.
+
+    Raises:
+      FileError: naming the file and what is wrong with its map.
+      OSError: if there is no such file.
+    """
     try:
         track = racetrack(path, discount=_DISCOUNT if discount is None else discount)
     except ValueError as error:
@@ -162,7 +180,7 @@ def _archive(path: str, discount: float | None) -> Problem:
     mdp = load_mdp(path, discount=discount)
     arrays = load_arrays(path, "reward", "coordinates", "terminal")
     try:
-        known = {name: _CHECKS[name](mdp, array) for name, array in arrays.items()}
+        known: dict[str, Any] = {name: _CHECKS[name](mdp, array) for name, array in arrays.items()}
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
     return Problem(name=path, mdp=mdp, **known)
@@ -188,7 +206,7 @@ def _terminal(mdp: MDP, terminal: np.ndarray) -> np.ndarray:
 _CHECKS = {"reward": _reward, "coordinates": check_coordinates, "terminal": _terminal}
 
 
-def load_trajectories(problem: Problem, options) -> tuple[Demonstrations, str]:
+def load_trajectories(problem: Problem, options: argparse.Namespace) -> tuple[Demonstrations, str]:
     """The demonstrations of `--demonstrations` or `--expert`, and where they come from, in words.
 
     Raises:

@@ -11,7 +11,9 @@ Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` it
 before it is needed.
 """
 
-from jaxhom.interop.environments import GymnasiumModel, from_gymnasium, make_environment
+from jaxhom.interop.csv_steps import demonstrations_from_csv
+from jaxhom.interop.environment_makers import make_environment
+from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
 from jaxhom.interop.files import (
     FileError,
     load_arrays,
@@ -22,11 +24,10 @@ from jaxhom.interop.files import (
     save_mdp,
     save_policy,
 )
+from jaxhom.interop.import_reports import ImportReport
 from jaxhom.interop.matrices import from_mdptoolbox, from_scipy
 from jaxhom.interop.samples import SampledModel, from_samples
 from jaxhom.interop.trajectories import (
-    ImportReport,
-    demonstrations_from_csv,
     demonstrations_from_episodes,
     demonstrations_from_steps,
     demonstrations_from_transitions,

@@ -6,16 +6,23 @@
 Their tables hold no geometry; it is in attributes that only these two have.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.models.mdp import MDP
 
+if TYPE_CHECKING:
+    import gymnasium
+
 _UP, _DOWN, _LEFT, _RIGHT = (-1, 0), (1, 0), (0, -1), (0, 1)
 _LAKE_LETTERS = {b"S": "S", b"F": ".", b"H": "#", b"G": "F"}
 
 
-def tile_map(env, mdp: MDP) -> TileMap | None:
+def tile_map(env: gymnasium.Env, mdp: MDP) -> TileMap | None:
     """The map of an environment's model.
 
     Args:
@@ -25,11 +32,11 @@ def tile_map(env, mdp: MDP) -> TileMap | None:
     Returns:
       The map; None for environments that have none, and for models with a state that is no cell (`end_state=True`).
     """
-    env = getattr(env, "unwrapped", env)
-    layout = _LAYOUTS.get(type(env).__name__)
+    inner = getattr(env, "unwrapped", env)
+    layout = _LAYOUTS.get(type(inner).__name__)
     if layout is None:
         return None
-    rows, moves = layout(env)
+    rows, moves = layout(inner)
     fits = sum(map(len, rows)) == mdp.num_states and len(moves) == mdp.num_actions
     return TileMap.from_rows(mdp, rows, moves) if fits else None
 

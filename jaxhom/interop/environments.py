@@ -15,25 +15,31 @@ there is `end_state=True`, where every terminated outcome leads to one further, 
 states of the environment stay as they are. That is right for every table.
 """
 
-import contextlib
-import dataclasses
-import inspect
-import warnings
-from collections.abc import Mapping
+from __future__ import annotations
 
-import jax
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import scipy.sparse
 
 from jaxhom import checks
+from jaxhom.interop.environment_makers import make_environment
+from jaxhom.interop.environment_tables import (
+    TransitionTable,
+    name_of,
+    read_table,
+    require_known_options,
+    require_steps_of_table,
+)
 from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
 
-_OUTSIDE_THE_TABLE = ("fickle_passenger",)  # options of Gymnasium's environments that act in `step` alone
+if TYPE_CHECKING:
+    import gymnasium
+    from jaxtyping import Array, ArrayLike, Bool, Float
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class GymnasiumModel:
+class GymnasiumModel(Record):
     """The model of an environment, and the reward that its authors gave it. See `from_gymnasium`.
 
     Attributes:
@@ -43,11 +49,18 @@ class GymnasiumModel:
     """
 
     mdp: MDP
-    reward: jax.Array
-    terminal: jax.Array
+    reward: Float[Array, "S A"]
+    terminal: Bool[Array, "S"]
 
 
-def from_gymnasium(env, *, discount, features=None, initial=None, end_state: bool = False) -> GymnasiumModel:
+def from_gymnasium(
+    env: gymnasium.Env | str,
+    *,
+    discount: Float[ArrayLike, ""],
+    features: Float[ArrayLike, "S *A K"] | None = None,
+    initial: Float[ArrayLike, "S"] | None = None,
+    end_state: bool = False,
+) -> GymnasiumModel:
     """Builds the model of a Gymnasium environment from its table `env.unwrapped.P`.
 
     Args:
@@ -68,6 +81,8 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
         (`require_steps_of_table`); and as `MDP.from_successors`.
       ImportError: for an id, if Gymnasium is not installed.
 
+    Outside jit, vmap and grad only: the table is read on the host.
+
     Example:
       >>> lake = from_gymnasium("FrozenLake-v1", discount=0.99)
       >>> lake.mdp.num_states, lake.mdp.num_actions, int(lake.terminal.sum())
@@ -80,230 +95,56 @@ def from_gymnasium(env, *, discount, features=None, initial=None, end_state: boo
             return from_gymnasium(env, discount=discount, features=features, initial=initial, end_state=end_state)
         finally:
             env.close()
-    next_state, probability, outcome_reward, terminated, allowed = _table(env)
-    _require_same_steps(env)
-    initial = _initial(env, initial, len(next_state))
-    reward = np.sum(probability * outcome_reward, axis=-1)
-    has_rows = allowed.any(axis=1)  # elsewhere nothing goes on, however such a state was entered
+    table = read_table(env)
+    require_known_options(env)
+    start = _initial(env, initial, len(table.allowed))
+    goes_on = table.allowed.any(axis=1)  # elsewhere nothing follows, however such a state was entered
     message = "is positive, but P has no outcome there: no episode can start where nothing follows"
-    checks.require_all("initial", initial, has_rows | (initial == 0), message)
-    terminal = ~has_rows
+    checks.require_all("initial", start, goes_on | (start == 0), message)
     if end_state:
-        next_state = np.where(terminated, len(next_state), next_state)
-        next_state, probability, reward = (_with_row(array) for array in (next_state, probability, reward))
-        terminal, allowed = np.append(terminal, True), np.concatenate([allowed, np.ones_like(allowed[:1])])
-        initial = np.append(initial, 0.0)
-        features = None if features is None else _with_row(_state_features(features, len(initial) - 1))
+        features = None if features is None else _with_row(_state_features(features, len(start)))
+        table, start, terminal = _with_end_state(table), np.append(start, 0.0), np.append(~goes_on, True)
     else:
-        terminal[next_state[terminated]] = True
-        _require_ends(next_state, probability, terminated, terminal & has_rows, initial)
-    reward[terminal] = 0.0
-    next_state[terminal] = np.flatnonzero(terminal)[:, None, None]
-    probability[terminal] = np.arange(probability.shape[-1]) == 0
-    allowed[terminal] = True
-    mdp = MDP.from_successors(
-        next_state,
-        probability,
-        discount=discount,
-        initial=initial,
-        features=features,
-        allowed=None if allowed.all() else allowed,
+        terminal = np.array(~goes_on)
+        terminal[table.next_state[table.terminated]] = True
+        _require_ends(table.next_state, table.probability, table.terminated, terminal & goes_on, start)
+    return _model(_with_absorbing(table, terminal), terminal, discount=discount, initial=start, features=features)
+
+
+def _with_end_state(table: TransitionTable) -> TransitionTable:
+    """The table with one state more, where every terminated outcome leads."""
+    next_state = np.where(table.terminated, len(table.allowed), table.next_state)
+    allowed = np.concatenate([table.allowed, np.ones_like(table.allowed[:1])])
+    return TransitionTable(
+        next_state=_with_row(next_state),
+        probability=_with_row(table.probability),
+        reward=_with_row(table.reward),
+        terminated=_with_row(table.terminated),
+        allowed=allowed,
     )
+
+
+def _with_absorbing(table: TransitionTable, terminal: np.ndarray) -> TransitionTable:
+    """The table with terminal states, bool [S], that every action leaves where they are, at no reward."""
+    here = np.arange(len(terminal))[:, None, None]
+    alone = np.arange(table.probability.shape[-1]) == 0  # one outcome of probability 1
+    is_end = terminal[:, None, None]
+    return TransitionTable(
+        next_state=np.where(is_end, here, table.next_state),
+        probability=np.where(is_end, alone, table.probability),
+        reward=np.where(is_end, 0.0, table.reward),
+        terminated=table.terminated,
+        allowed=table.allowed | terminal[:, None],
+    )
+
+
+def _model(table: TransitionTable, terminal: np.ndarray, **options: Any) -> GymnasiumModel:
+    """The model of a table, whose reward is the expected one of a step."""
+    allowed = None if table.allowed.all() else table.allowed
+    mdp = MDP.from_successors(table.next_state, table.probability, allowed=allowed, **options)
+    reward = np.sum(table.probability * table.reward, axis=-1)
     reward = checks.to_device(checks.require_floats_in(mdp.dtype, "expected reward", reward))
     return GymnasiumModel(mdp=mdp, reward=reward, terminal=checks.to_device(terminal))
-
-
-def make_environment(name: str, **options):
-    """Makes a Gymnasium environment.
-
-    Args:
-      name: its id, `"FrozenLake-v1"`.
-      **options: what its constructor takes, `is_slippery=False`.
-
-    Returns:
-      The environment.
-
-    Raises:
-      ValueError: if there is no such environment, it lacks an option, one that is on or off is given something else
-        (a text would count as on, whatever it says), or it refuses the options.
-      ImportError: if Gymnasium is not installed.
-    """
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise ImportError(
-            f"making {name!r} needs gymnasium, which is not installed: pip install '.[interop]'"
-        ) from error
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # the version is the caller's choice
-            _require_options(gymnasium, name, options)
-            return gymnasium.make(name, **options)
-    except gymnasium.error.Error as error:
-        reason = str(error).partition("\n")[0]
-    except _OptionError as error:
-        raise ValueError(f"environment {name!r}: {error}") from None
-    except Exception as error:  # constructors raise what they come upon
-        reason = f"{type(error).__name__} {' '.join(str(error).split())}"
-    given = f" with {', '.join(f'{key}={value!r}' for key, value in options.items())}" if options else ""
-    raise ValueError(f"environment {name!r} cannot be made{given}: {reason}")
-
-
-class _OptionError(ValueError):
-    """An option that an environment does not have, or that cannot mean what it says."""
-
-
-def _require_options(gymnasium, name: str, options: dict) -> None:
-    """Raises on an option that a constructor does not name, and on one that is on or off and neither."""
-    if not options:
-        return
-    known = _parameters(gymnasium.envs.registration.load_env_creator, gymnasium.spec(name).entry_point)
-    if known is None:
-        return
-    of_make = inspect.signature(gymnasium.make).parameters
-    for option, value in options.items():
-        if option not in known and option not in of_make:
-            raise _OptionError(f"it has no option {option!r}; it has {', '.join(known) or 'none'}")
-        default = known[option].default if option in known else None
-        if isinstance(default, bool) and not (isinstance(value, bool | np.bool_) or value in (0, 1)):
-            raise _OptionError(f"{option} must be true or false, got {value!r}")
-
-
-def _parameters(load, entry_point) -> dict | None:
-    """The named parameters of what makes an environment; None where they are not known, or any name will do."""
-    try:
-        parameters = inspect.signature(load(entry_point) if isinstance(entry_point, str) else entry_point).parameters
-    except (TypeError, ValueError):
-        return None
-    kinds = {parameter.kind for parameter in parameters.values()}
-    return None if inspect.Parameter.VAR_KEYWORD in kinds else dict(parameters)
-
-
-def require_steps_of_table(env, num_steps: int = 200) -> None:
-    """Takes random steps in an environment and raises if one is not in its table `P`.
-
-    An option or a wrapper may act in `step` alone, and then the table is not the model of what an agent meets. The
-    environment is reset and stepped: not for one in which an episode is under way.
-
-    Args:
-      env: the environment. Nothing is checked if it has no table, its observations are no states, or it cannot be
-        stepped.
-      num_steps: how many.
-
-    Raises:
-      ValueError: naming the first state, action and next state that the table gives no probability.
-    """
-    table, found = getattr(env.unwrapped, "P", None), None
-    with warnings.catch_warnings(), contextlib.suppress(Exception):  # the environment's own, whatever they are
-        warnings.simplefilter("ignore")
-        found = _step_outside(env, table, num_steps)
-    if found is not None:
-        state, action, successor = found
-        raise ValueError(
-            f"{_name(env)}: action {action} led from state {state} to {successor}, which its table P gives "
-            "probability 0: an option or a wrapper acts outside the table; make it without, or record "
-            "transitions and estimate a model with jaxhom.interop.from_samples"
-        )
-
-
-def _step_outside(env, table, num_steps: int) -> tuple | None:
-    """The first of some random steps that is not in the table: state, action, next state; None if all are."""
-    rng = np.random.default_rng(0)
-    state = env.reset(seed=0)[0]
-    for _ in range(num_steps):
-        actions = range(_num_actions(table[int(state)])) if _is_state(state, table) else ()
-        actions = [action for action in actions if len(_outcomes(table[int(state)], action))]
-        if not actions:
-            return None
-        action = actions[rng.integers(len(actions))]
-        successor, _, terminated, truncated, _ = env.step(action)
-        outcomes = _outcomes(table[int(state)], action)
-        if _is_state(successor, table) and not any(o[0] > 0 and o[1] == successor for o in outcomes):
-            return state, action, successor
-        state = env.reset()[0] if terminated or truncated else successor
-    return None
-
-
-def _is_state(observation, table) -> bool:
-    return np.ndim(observation) == 0 and np.asarray(observation).dtype.kind in "iu" and 0 <= observation < len(table)
-
-
-def _table(env) -> tuple[np.ndarray, ...]:
-    """Next states, probabilities, rewards and terminations, [S, A, N], padded with 0; and `allowed` [S, A]."""
-    table = getattr(getattr(env, "unwrapped", env), "P", None)
-    if table is None:
-        raise ValueError(
-            f"{_name(env)} has no transition table P: record transitions in it, and estimate a model with "
-            "jaxhom.interop.from_samples"
-        )
-    entries, allowed = _entries(_rows(table, _name(env)))
-    probability, next_state, reward, terminated = np.moveaxis(entries, -1, 0)
-    probability = checks.require_distribution("P: probability", probability, None if allowed.all() else allowed)
-    next_state = checks.require_integers("P: next state", next_state, upper=len(entries))
-    reward = checks.require_floats("P: reward", reward)
-    return next_state, probability.copy(), reward, (terminated != 0) & (probability > 0), allowed
-
-
-def _entries(rows: list[list]) -> tuple[np.ndarray, np.ndarray]:
-    """The table's numbers, [S, A, N, 4], padded with zeros, and which pairs have any, [S, A]."""
-    width = max(1, max(len(outcomes) for row in rows for outcomes in row))
-    checks.require_slots(len(rows), len(rows[0]), width)
-    entries = np.zeros((len(rows), len(rows[0]), width, 4))
-    allowed = np.array([[len(outcomes) > 0 for outcomes in row] for row in rows])
-    for s, row in enumerate(rows):
-        for a, outcomes in enumerate(row):
-            for i, outcome in enumerate(outcomes):
-                try:
-                    probability, next_state, reward, terminated = outcome
-                    entries[s, a, i] = probability, next_state, reward, terminated
-                except (TypeError, ValueError):
-                    expected = "(probability, next state, reward, terminated)"
-                    got = checks.in_one_line(outcome)
-                    raise ValueError(f"P[{s}][{a}][{i}] must be {expected}, got {got}") from None
-    return entries, allowed
-
-
-def _rows(table, name: str) -> list[list]:
-    """The table as nested lists, whatever it is kept in: states 0 ... S-1, each with actions 0 ... A-1.
-
-    Where a state lacks an action (a dictionary without it, or no outcomes), its list is empty.
-    """
-    try:
-        num_states = len(table)
-        num_actions = max((_num_actions(table[s]) for s in range(num_states)), default=0)
-        rows = [[list(_outcomes(table[s], a)) for a in range(_num_actions(table[s]))] for s in range(num_states)]
-    except (TypeError, KeyError, IndexError) as error:
-        raise ValueError(
-            f"P of {name} must hold a list of outcomes as P[state][action], both numbered from 0: "
-            f"{type(error).__name__} {error}"
-        ) from None
-    if not num_states or not num_actions:
-        raise ValueError(f"P of {name} must have at least one state and one action")
-    return [row + [[] for _ in range(num_actions - len(row))] for row in rows]
-
-
-def _num_actions(actions) -> int:
-    """The actions of one state: up to the largest number in a dictionary."""
-    return max(actions, default=-1) + 1 if isinstance(actions, Mapping) else len(actions)
-
-
-def _outcomes(actions, action: int):
-    return actions.get(action, ()) if isinstance(actions, Mapping) else actions[action]
-
-
-def _require_same_steps(env) -> None:
-    """Raises where an option makes the environment do what its table does not say (Taxi's fickle passenger)."""
-    given = getattr(getattr(env, "spec", None), "kwargs", {})
-    for option in _OUTSIDE_THE_TABLE:
-        if given.get(option) or getattr(getattr(env, "unwrapped", env), option, False):
-            raise ValueError(
-                f"{_name(env)} was made with {option}=True, which its table P does not contain: make it without, or "
-                "record transitions and estimate a model with jaxhom.interop.from_samples"
-            )
-
-
-def _name(env) -> str:
-    return f"environment {type(getattr(env, 'unwrapped', env)).__name__}"
 
 
 def _initial(env, initial, num_states: int) -> np.ndarray:
@@ -312,7 +153,7 @@ def _initial(env, initial, num_states: int) -> np.ndarray:
         initial = getattr(getattr(env, "unwrapped", env), "initial_state_distrib", None)
     if initial is None:
         raise ValueError(
-            f"{_name(env)} has no initial_state_distrib: pass initial, the distribution of the first state"
+            f"{name_of(env)} has no initial_state_distrib: pass initial, the distribution of the first state"
         )
     initial = checks.as_host_array("initial", initial)
     checks.require_shape("initial", initial, f"({num_states},)", initial.shape == (num_states,))

@@ -22,15 +22,21 @@ Anything that `numpy.savez` wrote with these names is read. What is read goes th
 whatever is wrong is one `FileError` that names the file and the array. A file of a newer format is refused.
 """
 
+from __future__ import annotations
+
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float, Shaped
 
 FORMAT_VERSION = 1
 
@@ -39,7 +45,7 @@ class FileError(ValueError):
     """A file that cannot be read as what it should be; the message is one line that names it."""
 
 
-def load_mdp(path: str | os.PathLike, *, discount: float | None = None) -> MDP:
+def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None = None) -> MDP:
     """Reads a model (see the module's table), in the dtype of its probabilities.
 
     Args:
@@ -49,6 +55,15 @@ def load_mdp(path: str | os.PathLike, *, discount: float | None = None) -> MDP:
     Raises:
       FileError: if the file is missing, truncated, of another kind, or holds invalid values, or if there are two
         discounts.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "rooms.npz")
+      >>> np.savez(path, transition=np.full((2, 1, 2), 0.5), discount=0.9)
+      >>> load_mdp(path).num_states
+      2
     """
     arrays = _read(path)
     options = {name: arrays[name] for name in ("initial", "features", "allowed") if name in arrays}
@@ -75,6 +90,15 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
 
     Raises:
       FileError: as `load_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "walks.npz")
+      >>> np.savez(path, states=[[0, 1, 1], [0, 2, 0]], actions=[[1, 1, 0], [1, 0, 0]], length=[2, 3])
+      >>> load_demonstrations(path).mask.tolist()
+      [[True, True, False], [True, True, True]]
     """
     arrays = _read(path)
     _require(path, arrays, "states", "actions")
@@ -100,16 +124,34 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
 
     Raises:
       FileError: if the file is missing, truncated or of another kind.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "model.npz")
+      >>> np.savez(path, reward=[0.0, 1.0])
+      >>> load_arrays(path, "reward", "terminal")
+      {'reward': array([0., 1.])}
     """
     arrays = _read(path)
     return {name: arrays[name] for name in names if name in arrays}
 
 
-def load_policy(path: str | os.PathLike) -> np.ndarray:
+def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
     """Reads a policy [S, A].
 
     Raises:
       FileError: as `load_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "policy.npz")
+      >>> np.savez(path, policy=[[0.5, 0.5], [1.0, 0.0]])
+      >>> load_policy(path).tolist()
+      [[0.5, 0.5], [1.0, 0.0]]
     """
     arrays = _read(path)
     _require(path, arrays, "policy")
@@ -124,8 +166,17 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
 
     Raises:
       OSError: if the file cannot be written.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "grid.npz")
+      >>> save_mdp(path, jaxhom.gridworld(3).mdp)
+      >>> load_mdp(path).num_states
+      9
     """
-    layout = {"transition": mdp.probability} if mdp.is_dense else _fields(mdp, "next_state", "probability")
+    layout = {"transition": np.asarray(mdp.probability)} if mdp.is_dense else _fields(mdp, "next_state", "probability")
     allowed = _fields(mdp, "allowed") if mdp.restricts_actions else {}
     _write(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed})
 
@@ -136,6 +187,15 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     Raises:
       ValueError: if `mask` is not a prefix of every row, or leaves one empty.
       OSError: as `save_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "walks.npz")
+      >>> save_demonstrations(path, Demonstrations.from_trajectories([([0, 1], [1, 1])]))
+      >>> load_demonstrations(path).states.tolist()
+      [[0, 1]]
     """
     mask = np.asarray(demonstrations.mask)
     length = mask.sum(axis=1)
@@ -146,21 +206,30 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     _write(path, {**_fields(demonstrations, "states", "actions", "terminated", "final_states"), "length": length})
 
 
-def save_policy(path: str | os.PathLike, policy, **extras) -> None:
+def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extras: Shaped[ArrayLike, "..."]) -> None:
     """Writes a policy [S, A] and any further arrays by name.
 
     Raises:
       ValueError: if `policy` is none, or an extra has a reserved name or is no plain array.
       OSError: as `save_mdp`.
+
+    Outside jit, vmap and grad only.
+
+    Example:
+      >>> import pathlib, tempfile, jaxhom
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "policy.npz")
+      >>> save_policy(path, [[0.5, 0.5], [1.0, 0.0]], margin=0.25)
+      >>> load_arrays(path, "margin")["margin"].tolist()
+      0.25
     """
-    policy = _validated_policy(checks.as_host_array("policy", policy))
+    checked = _validated_policy(checks.as_host_array("policy", policy))
     arrays = {name: checks.as_host_array(name, array) for name, array in extras.items()}
     for name, array in arrays.items():
         if name in ("file", "format_version", "allow_pickle"):
             raise ValueError(f"an array of a policy's file cannot be called {name!r}")
         if array.dtype.hasobject:
             raise ValueError(f"{name} must be a plain array, got dtype {array.dtype}")
-    _write(path, {"policy": policy, **arrays})
+    _write(path, {"policy": checked, **arrays})
 
 
 def _validated_policy(policy: np.ndarray) -> np.ndarray:
@@ -173,7 +242,7 @@ def _fields(value, *names: str) -> dict[str, np.ndarray]:
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike):
+def whole_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """A file to write bytes to that is `path` once all is written: an interrupted write leaves no half of it there.
 
     Raises:
@@ -194,7 +263,8 @@ def whole_file(path: str | os.PathLike):
 
 def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
     with whole_file(path) as file:
-        np.savez_compressed(file, format_version=FORMAT_VERSION, **arrays)
+        named: dict[str, Any] = {"format_version": FORMAT_VERSION, **arrays}
+        np.savez_compressed(file, **named)
 
 
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:

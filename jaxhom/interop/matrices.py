@@ -8,7 +8,10 @@ Rewards of a toolbox: [S] and [S, A] are what `optimal_policy` and `policy_value
 transition, becomes [S, A] by `numpy.einsum("asz,asz->sa", transitions, reward)`.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 import scipy.sparse
@@ -16,8 +19,18 @@ import scipy.sparse
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
 
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool, Float
 
-def from_mdptoolbox(transitions, *, discount, initial=None, features=None, allowed=None) -> MDP:
+
+def from_mdptoolbox(
+    transitions: Float[ArrayLike, "A S S"] | Sequence[Any],
+    *,
+    discount: Float[ArrayLike, ""],
+    initial: Float[ArrayLike, "S"] | None = None,
+    features: Float[ArrayLike, "S *A K"] | None = None,
+    allowed: Bool[ArrayLike, "S A"] | None = None,
+) -> MDP:
     """Builds a model from transitions in the layout of the MDP toolboxes.
 
     Args:
@@ -34,24 +47,35 @@ def from_mdptoolbox(transitions, *, discount, initial=None, features=None, allow
     Raises:
       ValueError: on a wrong shape, naming action, state and next state of the first entry that is not finite or
         negative, or action and state of the first row that does not sum to 1; and as `MDP.from_successors`.
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> stay, change = [[1.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]
+      >>> mdp = from_mdptoolbox([stay, change], discount=0.9)
+      >>> mdp.transition[0].tolist()  # of state 0, one row per action
+      [[1.0, 0.0], [0.0, 1.0]]
     """
     if scipy.sparse.issparse(transitions):
         raise ValueError(
             "transitions must be [A, S, S] or a sequence of A matrices; one sparse matrix is for from_scipy"
         )
-    is_object_array = isinstance(transitions, np.ndarray) and transitions.dtype.hasobject and transitions.ndim == 1
-    is_sequence = isinstance(transitions, list | tuple) or is_object_array
-    if is_sequence and any(scipy.sparse.issparse(matrix) for matrix in transitions):
-        return _from_sparse(list(transitions), discount, initial, features, allowed)
-    if is_sequence:
-        transitions = list(transitions)
-    transitions = checks.as_host_array("transitions", transitions)
-    good = transitions.ndim == 3 and transitions.shape[1] == transitions.shape[2] and min(transitions.shape) > 0
-    checks.require_shape("transitions", transitions, "[A, S, S] with A, S >= 1", good)
-    rows = None if allowed is None else _flags(allowed, transitions.shape[1], len(transitions))
-    transitions = checks.require_distribution("transitions", transitions, None if rows is None else rows.T)
+    matrices = list(transitions) if _is_sequence(transitions) else None
+    if matrices is not None and any(scipy.sparse.issparse(matrix) for matrix in matrices):
+        return _from_sparse(matrices, discount, initial, features, allowed)
+    array = checks.as_host_array("transitions", transitions if matrices is None else matrices)
+    good = array.ndim == 3 and array.shape[1] == array.shape[2] and min(array.shape) > 0
+    checks.require_shape("transitions", array, "[A, S, S] with A, S >= 1", good)
+    rows = None if allowed is None else _flags(allowed, array.shape[1], len(array))
+    array = checks.require_distribution("transitions", array, None if rows is None else rows.T)
     options = {"initial": initial, "features": features, "allowed": rows}
-    return MDP.from_dense(np.moveaxis(transitions, 0, 1), discount=discount, **options)
+    return MDP.from_dense(np.moveaxis(array, 0, 1), discount=discount, **options)
+
+
+def _is_sequence(transitions) -> TypeGuard[Sequence[Any]]:
+    """Whether something is a sequence of matrices rather than one array."""
+    is_object_array = isinstance(transitions, np.ndarray) and transitions.dtype.hasobject and transitions.ndim == 1
+    return isinstance(transitions, list | tuple) or is_object_array
 
 
 def _flags(allowed, num_states: int, num_actions: int) -> np.ndarray:
@@ -79,7 +103,14 @@ def _from_sparse(matrices: list, discount, initial, features, allowed) -> MDP:
     return _from_rows(rows[order], num_actions, discount, initial, features, allowed)
 
 
-def from_scipy(matrix, *, discount, initial=None, features=None, allowed=None) -> MDP:
+def from_scipy(
+    matrix: scipy.sparse.sparray | scipy.sparse.spmatrix,
+    *,
+    discount: Float[ArrayLike, ""],
+    initial: Float[ArrayLike, "S"] | None = None,
+    features: Float[ArrayLike, "S *A K"] | None = None,
+    allowed: Bool[ArrayLike, "S A"] | None = None,
+) -> MDP:
     """Builds a model from one sparse matrix with a row per state-action pair.
 
     Args:
@@ -96,6 +127,14 @@ def from_scipy(matrix, *, discount, initial=None, features=None, allowed=None) -
     Raises:
       ValueError: on a matrix that is not sparse or has another shape, naming row and column of the first entry that is
         not finite or negative, or the first row that does not sum to 1; and as `MDP.from_successors`.
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> rows = scipy.sparse.csr_array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.0, 1.0]])
+      >>> mdp = from_scipy(rows, discount=0.9)
+      >>> mdp.num_states, mdp.num_actions
+      (2, 2)
     """
     if not scipy.sparse.issparse(matrix):
         raise ValueError(f"matrix must be a SciPy sparse matrix, got {type(matrix).__name__}")

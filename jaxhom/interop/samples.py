@@ -27,9 +27,10 @@ support alone would call a row certain that was visited once. So for "observed" 
 can be. With alpha = 0 (maximum likelihood) there is no such class, and what was not seen counts as impossible.
 """
 
-import dataclasses
+from __future__ import annotations
 
-import jax
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
@@ -38,13 +39,15 @@ import scipy.special
 from jaxhom import checks
 from jaxhom.interop.matrices import from_scipy
 from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Float, Int
 
 SUPPORTS = ("observed", "all")
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class SampledModel:
+class SampledModel(Record):
     """A model estimated from transitions. See `from_samples`.
 
     Attributes:
@@ -55,23 +58,23 @@ class SampledModel:
     """
 
     mdp: MDP
-    count: jax.Array
-    expected_l1_error: jax.Array
-    standard_deviation: jax.Array
+    count: Int[Array, "S A"]
+    expected_l1_error: Float[Array, "S A"]
+    standard_deviation: Float[Array, "S A"]
 
 
 def from_samples(
-    states,
-    actions,
-    next_states,
+    states: Int[ArrayLike, "T"],
+    actions: Int[ArrayLike, "T"],
+    next_states: Int[ArrayLike, "T"],
     *,
     num_states: int,
     num_actions: int,
-    discount,
+    discount: Float[ArrayLike, ""],
     prior: float = 0.5,
     support: str = "observed",
-    initial=None,
-    features=None,
+    initial: Float[ArrayLike, "S"] | None = None,
+    features: Float[ArrayLike, "S *A K"] | None = None,
 ) -> SampledModel:
     """Estimates a model from transitions, and says how uncertain each of its rows is.
 
@@ -94,6 +97,10 @@ def from_samples(
     Raises:
       ValueError: on sequences of different lengths or none at all, naming the first entry that is out of range or not
         whole, on a negative or infinite `prior` or an unknown `support`; and as `MDP.from_successors`.
+
+    Outside jit, vmap and grad only: transitions are counted on the host.
+
+    Source: the beta distribution's moments, Gelman et al., Bayesian Data Analysis, 3rd ed., appendix A.
 
     Example:
       >>> model = from_samples([0, 0, 0], [0, 0, 0], [1, 1, 0], num_states=2, num_actions=1, discount=0.9, prior=1.0)

@@ -4,7 +4,10 @@ A `Board` is what a picture needs of a domain. A racetrack's state is a cell and
 per state is drawn as a mosaic of the 25 speeds, or as one number per cell.
 """
 
+from __future__ import annotations
+
 import dataclasses
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,6 +24,9 @@ from jaxhom.domains.racetrack import Racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.models.mdp import MDP
 from jaxhom.plotting.palette import AMOUNT, FAINT, INK, ROAD, START, WALL
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float
 
 BAR_ROOM, LEVEL_ROOM = 1.2, 2.0  # inches beside the map, for a colour bar with numbers and one with names
 
@@ -64,7 +70,7 @@ class Board:
     def states_at(self, speed) -> np.ndarray:
         """The state of each cell, [C]; with the given speed on a racetrack."""
         states = np.arange(self.num_cells) * self.per_cell
-        if self.per_cell == 1:
+        if not isinstance(self.domain, Racetrack):
             return states
         return states + self.domain.state_of(self.cells[0], speed)
 
@@ -87,7 +93,7 @@ class Board:
         return tiles.swapaxes(1, 2).reshape(self.shape[0] * side, self.shape[1] * side)
 
 
-def board_of(domain, kind=(Gridworld, Racetrack, TileMap)) -> Board:
+def board_of(domain: Gridworld | Racetrack | TileMap, kind: Any = (Gridworld, Racetrack, TileMap)) -> Board:
     """The board of a domain; `ValueError` unless the domain is of the given kind or one of the given kinds."""
     if not isinstance(domain, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
@@ -99,7 +105,8 @@ def board_of(domain, kind=(Gridworld, Racetrack, TileMap)) -> Board:
         return Board(domain, shape, domain.coordinates, is_open, 1, np.array(domain.moves))
     directions = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
     if isinstance(domain, Gridworld):
-        actions, cells, per_cell = GRIDWORLD_ACTIONS, np.asarray(domain.coordinates), 1
+        actions: tuple[str, ...] = GRIDWORLD_ACTIONS
+        cells, per_cell = np.asarray(domain.coordinates), 1
         shape, is_open = (domain.size, domain.size), np.ones(len(cells), bool)
     else:
         actions, cells, per_cell = RACETRACK_ACTIONS, np.asarray(domain.cells), len(domain.speeds)
@@ -109,7 +116,7 @@ def board_of(domain, kind=(Gridworld, Racetrack, TileMap)) -> Board:
     return Board(domain, shape, cells, is_open, per_cell, moves)
 
 
-def require(name: str, array, *shapes: tuple[int, ...]) -> np.ndarray:
+def require(name: str, array: ArrayLike, *shapes: tuple[int, ...]) -> np.ndarray:
     """Returns `array` as finite floats of one of the given shapes, or raises."""
     array = checks.as_host_array(name, array)
     checks.require_shape(name, array, " or ".join(map(str, shapes)), array.shape in shapes)
@@ -135,7 +142,7 @@ def ground(board: Board, ax: Axes | None, room: float = 0.0) -> Axes:
         borders = borders_of(board, np.ones(board.num_cells, int))
         color, width, margin = INK, 1.2, 0.9
         ax.spines[:].set_visible(False)
-    ax.add_collection(LineCollection(borders, colors=color, linewidths=width, zorder=2))
+    ax.add_collection(LineCollection(list(borders), colors=color, linewidths=width, zorder=2))
     ax.set(xlim=(-margin, columns - 1 + margin), ylim=(rows - 1 + margin, -margin), aspect="equal")
     ax.set(xlabel="column", ylabel="row")
     for axis in (ax.xaxis, ax.yaxis):
@@ -182,7 +189,7 @@ def colorbar(ax: Axes, board: Board, image, label: str, **style):
     """A colour bar as high as the map and as wide as fits it."""
     rows, columns = board.shape
     width = 0.04 * max(rows, 16) / max(columns, 16)
-    place = ax.inset_axes([1.0 + width / 2, 0.0, width, 1.0])
+    place = ax.inset_axes((1.0 + width / 2, 0.0, width, 1.0))
     bar = ax.figure.colorbar(image, cax=place, label=label, **style)
     bar.outline.set_visible(False)
     return bar
@@ -194,11 +201,11 @@ def heat(ax: Axes, board: Board, values: np.ndarray, label: str, norm=None) -> N
     colorbar(ax, board, image, label)
 
 
-def policy_at(board: Board, policy, speed) -> np.ndarray:
+def policy_at(board: Board, policy: Float[ArrayLike, "S A"], speed: tuple[int, int]) -> np.ndarray:
     """[S, A] -> the probabilities to draw, [C, A]: of one speed, of open cells, not negligible."""
     shape = (board.num_states, len(board.moves))
-    policy = require("policy", policy, shape)[board.states_at(speed)]
-    return np.where(board.is_open[:, None] & (policy >= _LEAST_PROBABILITY), policy, 0.0)
+    shown = require("policy", policy, shape)[board.states_at(speed)]
+    return np.where(board.is_open[:, None] & (shown >= _LEAST_PROBABILITY), shown, 0.0)
 
 
 def draw_arrows(ax: Axes, board: Board, policy: np.ndarray, color: str) -> None:
@@ -209,8 +216,8 @@ def draw_arrows(ax: Axes, board: Board, policy: np.ndarray, color: str) -> None:
     shown = arrow.any(axis=-1)
     tail = np.broadcast_to(tail, arrow.shape)[shown]
     y, x, dy, dx = np.concatenate([tail, arrow[shown]], axis=-1).T
-    style = {"width": 0.075, "headwidth": 3.6, "headlength": 3.2, "headaxislength": 2.9}
-    placed = {"angles": "xy", "units": "xy", "scale_units": "xy", "scale": 1.0}
+    style: dict[str, Any] = {"width": 0.075, "headwidth": 3.6, "headlength": 3.2, "headaxislength": 2.9}
+    placed: dict[str, Any] = {"angles": "xy", "units": "xy", "scale_units": "xy", "scale": 1.0}
     ax.quiver(x, y, dx, dy, color=color, zorder=4, **placed, **style)
     cell, action = np.nonzero((policy > 0) & ~board.moves.any(axis=-1))
     if cell.size:

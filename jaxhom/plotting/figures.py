@@ -1,7 +1,10 @@
 """Whole figures: the picture that the command line saves."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import jax
 import matplotlib.pyplot as plt
@@ -18,20 +21,23 @@ from jaxhom.plotting.boards import Board, board_of, draw_arrows, policy_at, requ
 from jaxhom.plotting.palette import BLACK, BLUE, GREEN, INK, ORANGE, PURPLE, TINT, VERMILLION
 from jaxhom.plotting.pictures import plot_gridworld, plot_racetrack, plot_trajectories, unpadded
 
-_STRIP_WIDTH = 5.2  # inches
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Float, Key
+
+_STRIP_WIDTH = 5.2  # inches, where the title of a strip finds room
 _NUM_TRIALS = 99  # of which the figure shows the median one
 
 
 def learned_policy_figure(
     gridworld: Gridworld,
-    reward,
+    reward: Float[ArrayLike, "S *A"],
     gridworld_demonstrations: Demonstrations,
-    gridworld_policy,
+    gridworld_policy: Float[ArrayLike, "S A"],
     racetrack: Racetrack,
     racetrack_demonstrations: Demonstrations,
-    racetrack_policies: Mapping[str, jax.Array],
+    racetrack_policies: Mapping[str, Float[Array, "S A"]],
     *,
-    key: jax.Array,
+    key: Key[Array, ""],
     horizon: int = 30,
 ) -> Figure:
     """Draws the library's story: few demonstrations in, a policy for every state out.
@@ -59,6 +65,18 @@ def learned_policy_figure(
 
     Raises:
       ValueError: if a shape does not fit, or there is no policy for the racetrack.
+
+    Outside jit, vmap and grad only: trials are sampled and drawn on the host.
+
+    Example:
+      >>> import jaxhom
+      >>> world, track = jaxhom.gridworld(4), jaxhom.racetrack(["XXXX", "S..F", "XXXX"])
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1], [3, 3])])
+      >>> drive = jaxhom.Demonstrations.from_trajectories([([12, 38], [4, 4])])
+      >>> uniform = {name: np.full((domain.mdp.num_states, actions), 1 / actions)
+      ...     for name, domain, actions in (("world", world, 4), ("track", track, 5))}
+      >>> figure = learned_policy_figure(world, np.arange(16.0), walk, uniform["world"], track, drive,
+      ...     {"uniform": uniform["track"]}, key=jax.random.key(0))
     """
     if not racetrack_policies:
         raise ValueError("racetrack_policies must name at least one policy")
@@ -72,7 +90,7 @@ def learned_policy_figure(
     trials = {name: _median_trial(key, racetrack, policy, horizon) for name, policy in racetrack_policies.items()}
     left, right = _two_halves(board_of(racetrack, Racetrack), len(trials))
     reward = reward.reshape(world.num_states, -1).max(axis=1)
-    _draw_learned_gridworld(left, world, reward, gridworld_demonstrations, arrows)
+    _draw_learned_gridworld(left, gridworld, reward, gridworld_demonstrations, arrows)
     palette = itertools.cycle((BLACK, VERMILLION, BLUE, PURPLE, GREEN, ORANGE))
     axes = right.subplots(len(trials), squeeze=False)[:, 0]
     for ax, color, (name, trial) in zip(axes, palette, trials.items(), strict=False):
@@ -93,11 +111,11 @@ def _two_halves(board: Board, num_strips: int):
     return figure.subfigures(1, 2, width_ratios=widths)
 
 
-def _draw_learned_gridworld(figure, board: Board, reward, demonstrations, arrows) -> None:
+def _draw_learned_gridworld(figure, gridworld: Gridworld, reward, demonstrations, arrows) -> None:
     """The left half of `learned_policy_figure`."""
-    ax = plot_gridworld(board.domain, values=reward, label="true reward", ax=figure.subplots())
-    plot_trajectories(board.domain, demonstrations, ax=ax)
-    draw_arrows(ax, board, arrows, INK)
+    ax = plot_gridworld(gridworld, values=reward, label="true reward", ax=figure.subplots())
+    plot_trajectories(gridworld, demonstrations, ax=ax)
+    draw_arrows(ax, board_of(gridworld), arrows, INK)
     count = demonstrations.num_trajectories
     _strip(ax, f"Learned from {count} demonstration{'s' * (count != 1)}")
     lines = _marker("o-", "demonstration", color=VERMILLION, markersize=3)
@@ -115,8 +133,8 @@ def _marker(shape, label: str, *, color: str = INK, markersize: float = 6) -> Li
     """A legend's entry: a marker, followed by "-" for one on a line."""
     on_line = isinstance(shape, str) and shape.endswith("-")
     marker, line = (shape[:-1], "-") if on_line else (shape, "")
-    style = {"markersize": markersize, "markeredgewidth": 0}
-    return Line2D([], [], color=color, marker=marker, linestyle=line, label=label, **style)
+    style: dict[str, Any] = {"linestyle": line, "markersize": markersize, "markeredgewidth": 0}
+    return Line2D([], [], color=color, marker=marker, label=label, **style)
 
 
 def _legend(figure, *entries) -> None:

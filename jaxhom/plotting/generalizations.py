@@ -4,6 +4,11 @@ Two kinds of state have a colour and a sign of their own, so that neither depend
 states, a cross where nothing was found. All others run through cividis, from bright (near, few) to dark (far, many).
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import colors
@@ -15,6 +20,7 @@ from jaxhom import checks
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import ACTIONS as RACETRACK_ACTIONS
 from jaxhom.domains.racetrack import Racetrack
+from jaxhom.domains.tile_map import TileMap
 from jaxhom.generalization.result import Generalization
 from jaxhom.plotting.boards import (
     LEVEL_ROOM,
@@ -31,6 +37,9 @@ from jaxhom.plotting.boards import (
 )
 from jaxhom.plotting.palette import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool, Int
+
 _NOTHING, _DEMONSTRATED = -1, 0
 _NAMES = ["\N{MULTIPLICATION SIGN} nothing found", "\N{BULLET} demonstrated"]
 _MIXED = 0  # no action has more than half of the probability
@@ -40,7 +49,11 @@ _WIDE = 1.6  # columns per row of a map from which on panels go below each other
 
 
 def plot_radius(
-    domain: Gridworld | Racetrack, radius, *, speed: tuple[int, int] | None = None, ax: Axes | None = None
+    domain: Gridworld | Racetrack | TileMap,
+    radius: Int[ArrayLike, "S"],
+    *,
+    speed: tuple[int, int] | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Colours states by the radius at which Algorithm 1 stopped: how far the expert's advice came.
 
@@ -48,7 +61,7 @@ def plot_radius(
     top to bottom, column speed -2 ... 2 from left to right.
 
     Args:
-      domain: a gridworld or a racetrack.
+      domain: a gridworld, a racetrack or a tile map.
       radius: int [S], `Generalization.radius`: 0 on demonstrated states, -1 where nothing was found; these two have
         colours and signs of their own, the others a scale.
       speed: racetrack only: the speed of the cars whose states are shown; the mosaic if None.
@@ -59,6 +72,15 @@ def plot_radius(
 
     Raises:
       ValueError: if the shape does not fit the domain, an entry is below -1 or not whole, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
+      >>> general = jaxhom.nearest_neighbors(world, walk)
+      >>> ax = plot_radius(world, general.radius)
     """
     board = board_of(domain)
     radius = require("radius", radius, (board.num_states,))
@@ -69,17 +91,17 @@ def plot_radius(
 
 
 def plot_support(
-    domain: Gridworld | Racetrack,
-    support,
+    domain: Gridworld | Racetrack | TileMap,
+    support: Int[ArrayLike, "S"],
     *,
-    visited=None,
+    visited: Bool[ArrayLike, "S"] | None = None,
     speed: tuple[int, int] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Colours states by how many demonstrated states their policy came from.
 
     Args:
-      domain: a gridworld or a racetrack.
+      domain: a gridworld, a racetrack or a tile map.
       support: int [S], `Generalization.support`: 0 where nothing was found, which has a colour and a sign of its own.
       visited: bool [S], demonstrated states, to be told from those with one voter.
       speed: as in `plot_radius`.
@@ -90,6 +112,15 @@ def plot_support(
 
     Raises:
       ValueError: if a shape does not fit the domain, an entry is negative or not whole, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
+      >>> general = jaxhom.nearest_neighbors(world, walk)
+      >>> ax = plot_support(world, general.support, visited=general.visited)
     """
     board = board_of(domain)
     support = require("support", support, (board.num_states,))
@@ -103,11 +134,11 @@ def plot_support(
 
 
 def plot_generalization(
-    domain: Gridworld | Racetrack,
+    domain: Gridworld | Racetrack | TileMap,
     general: Generalization,
     *,
     speed: tuple[int, int] | None = (0, 0),
-    ax=None,
+    ax: Sequence[Axes] | np.ndarray | None = None,
 ) -> np.ndarray:
     """Draws a generalization in three panels: how far it looked, how many states voted, and the policy.
 
@@ -119,7 +150,7 @@ def plot_generalization(
     half of the probability.
 
     Args:
-      domain: a gridworld or a racetrack.
+      domain: a gridworld, a racetrack or a tile map.
       general: a `Generalization` on its model.
       speed: racetrack only: (row, column) speed, each in -2 ... 2, or None.
       ax: three axes to draw on; a new figure if None.
@@ -129,6 +160,16 @@ def plot_generalization(
 
     Raises:
       ValueError: if a shape does not fit the domain, there is no such speed, or `ax` is not three axes.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
+      >>> general = jaxhom.nearest_neighbors(world, walk)
+      >>> [panel.get_title(loc="left") for panel in plot_generalization(world, general)]
+      ['radius', 'support', 'policy']
     """
     board = board_of(domain)
     mosaic = speed is None and board.per_cell > 1
@@ -145,7 +186,7 @@ def plot_generalization(
         _draw_actions(ground(board, panels[2]), board, policy, np.asarray(general.radius))
     else:
         _draw_policy(ground(board, panels[2]), board, policy)
-    whose = "" if board.per_cell == 1 else ", all speeds" if mosaic else f", speed ({speed[0]}, {speed[1]})"
+    whose = "" if board.per_cell == 1 else ", all speeds" if shown is None else f", speed ({shown[0]}, {shown[1]})"
     for panel, title in zip(panels, ("radius", "support", "policy"), strict=True):
         panel.set_title(f"{title}{whose}", loc="left", fontsize="medium")
     return panels
@@ -196,7 +237,7 @@ def _draw_signs(ax: Axes, board: Board, levels: np.ndarray) -> None:
     arm = 0.17 / side
     ends = np.array([[(-arm, -arm), (arm, arm)], [(-arm, arm), (arm, -arm)]])
     strokes = (crossed[:, None, None] + ends).reshape(-1, 2, 2)
-    ax.add_collection(LineCollection(strokes, colors=INK, linewidths=1.4 / side**0.5, zorder=2.5))
+    ax.add_collection(LineCollection(list(strokes), colors=INK, linewidths=1.4 / side**0.5, zorder=2.5))
     size = np.full(len(dotted), 0.32 / side)
     placed = {"offsets": dotted, "offset_transform": ax.transData}
     dots = EllipseCollection(size, size, np.zeros(len(dotted)), units="xy", color=INK, zorder=2.5, **placed)
@@ -228,7 +269,7 @@ def _draw_actions(ax: Axes, board: Board, policy: np.ndarray, radius: np.ndarray
 def _draw_cells(ax: Axes, board: Board) -> None:
     """Outlines of the cells of a mosaic."""
     borders = borders_of(board, np.arange(board.num_cells))
-    ax.add_collection(LineCollection(borders, colors="white", linewidths=0.8, zorder=2))
+    ax.add_collection(LineCollection(list(borders), colors="white", linewidths=0.8, zorder=2))
 
 
 def _three_panels(board: Board) -> np.ndarray:

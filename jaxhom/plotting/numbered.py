@@ -4,6 +4,10 @@ The counterparts of what is drawn on a map: a policy is an image of its probabil
 time, an occupancy a line of spikes, and the radii of a generalization a histogram.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,11 +19,16 @@ from jaxhom.plotting.boards import require
 from jaxhom.plotting.palette import AMOUNT, BLUE, PURPLE, VERMILLION
 from jaxhom.plotting.pictures import unpadded
 
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool, Float, Int
+
 _DECADES = 4  # of an occupancy that are told apart
 _NAMES = ("\N{MULTIPLICATION SIGN} nothing found", "\N{BULLET} demonstrated")
 
 
-def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axes:
+def plot_policy_by_state(
+    policy: Float[ArrayLike, "S A"], *, visited: Bool[ArrayLike, "S"] | None = None, ax: Axes | None = None
+) -> Axes:
     """Draws a policy as an image: states from left to right, actions from top to bottom, dark where likely.
 
     Args:
@@ -32,6 +41,13 @@ def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axe
 
     Raises:
       ValueError: if a shape does not fit.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> plot_policy_by_state(np.full((5, 2), 0.5), visited=np.arange(5) < 2).get_ylabel()
+      'action'
     """
     policy = checks.as_host_array("policy", policy)
     checks.require_shape("policy", policy, "[S, A]", policy.ndim == 2 and policy.size > 0)
@@ -40,8 +56,7 @@ def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axe
     if visited is not None:
         visited = require("visited", visited, (num_states,)) > 0
     ax = _axes(ax, height=1.4 + 0.25 * min(num_actions, 12))
-    style = {"aspect": "auto", "interpolation": "nearest", "cmap": AMOUNT, "vmin": 0.0, "vmax": 1.0}
-    image = ax.imshow(policy.T, **style)
+    image = ax.imshow(policy.T, aspect="auto", interpolation="nearest", cmap=AMOUNT, vmin=0.0, vmax=1.0)
     ax.figure.colorbar(image, ax=ax, label="probability").outline.set_visible(False)
     if visited is not None:
         marked = np.flatnonzero(visited)
@@ -54,7 +69,9 @@ def plot_policy_by_state(policy, *, visited=None, ax: Axes | None = None) -> Axe
     return ax
 
 
-def plot_occupancy_by_state(occupancy, *, label: str = "expected discounted visits", ax: Axes | None = None) -> Axes:
+def plot_occupancy_by_state(
+    occupancy: Float[ArrayLike, "S *A"], *, label: str = "expected discounted visits", ax: Axes | None = None
+) -> Axes:
     """Draws how often each state is visited, as spikes on a logarithmic axis.
 
     Args:
@@ -67,6 +84,12 @@ def plot_occupancy_by_state(occupancy, *, label: str = "expected discounted visi
 
     Raises:
       ValueError: if the shape does not fit, or no state is visited.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> plot_occupancy_by_state([3.0, 1.0, 0.1]).get_yscale()
+      'log'
     """
     occupancy = checks.as_host_array("occupancy", occupancy)
     checks.require_shape("occupancy", occupancy, "[S] or [S, A]", occupancy.ndim in (1, 2) and occupancy.size > 0)
@@ -91,6 +114,14 @@ def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None 
 
     Returns:
       The axes.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 5], [3, 1, 1])])
+      >>> plot_trajectories_by_state(walk).get_xlabel()
+      'step'
     """
     ax = _axes(ax, height=3.2)
     for states in unpadded(trajectories):
@@ -102,7 +133,7 @@ def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None 
     return _plain(ax)
 
 
-def plot_radius_counts(radius, *, ax: Axes | None = None) -> Axes:
+def plot_radius_counts(radius: Int[ArrayLike, "S"], *, ax: Axes | None = None) -> Axes:
     """Draws how many states found advice at which radius.
 
     Args:
@@ -115,6 +146,12 @@ def plot_radius_counts(radius, *, ax: Axes | None = None) -> Axes:
 
     Raises:
       ValueError: if the shape does not fit, or an entry is below -1 or not whole.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> [int(bar.get_height()) for bar in plot_radius_counts([0, 0, 1, 2, 2, -1]).patches]  # from -1 on
+      [1, 2, 1, 2]
     """
     radius = checks.as_host_array("radius", radius)
     checks.require_shape("radius", radius, "[S]", radius.ndim == 1 and radius.size > 0)

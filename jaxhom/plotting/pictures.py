@@ -1,5 +1,9 @@
 """Pictures of domains, policies, trajectories and occupancies, each on axes that are given or new."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from matplotlib import colors
 from matplotlib.axes import Axes
@@ -8,6 +12,7 @@ from matplotlib.patches import Rectangle
 
 from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import Racetrack
+from jaxhom.domains.tile_map import TileMap
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.plotting.boards import (
     BAR_ROOM,
@@ -20,17 +25,20 @@ from jaxhom.plotting.boards import (
 )
 from jaxhom.plotting.palette import INK, TINT, VERMILLION
 
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool, Float
+
 _DECADES = 4  # of an occupancy that are told apart
-_SPREAD = 0.4  # width of the lane, in cells, that several trajectories share
+_SPREAD = 0.4  # cells from the first to the last of several trajectories that run side by side
 
 
 def plot_gridworld(
     gridworld: Gridworld,
     *,
-    values=None,
-    policy=None,
+    values: Float[ArrayLike, "S"] | None = None,
+    policy: Float[ArrayLike, "S A"] | None = None,
     trajectories: Demonstrations | None = None,
-    visited=None,
+    visited: Bool[ArrayLike, "S"] | None = None,
     label: str = "value",
     ax: Axes | None = None,
 ) -> Axes:
@@ -50,6 +58,14 @@ def plot_gridworld(
 
     Raises:
       ValueError: if a shape does not fit the gridworld.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4, num_regions=4)
+      >>> plot_gridworld(world, values=np.arange(16.0), label="number").get_xlabel()
+      'column'
     """
     board = board_of(gridworld, Gridworld)
     if values is not None:
@@ -60,11 +76,11 @@ def plot_gridworld(
 def plot_racetrack(
     racetrack: Racetrack,
     *,
-    values=None,
-    policy=None,
+    values: Float[ArrayLike, "C"] | Float[ArrayLike, "S"] | None = None,
+    policy: Float[ArrayLike, "S A"] | None = None,
     speed: tuple[int, int] = (0, 0),
     trajectories: Demonstrations | None = None,
-    visited=None,
+    visited: Bool[ArrayLike, "S"] | None = None,
     label: str = "value",
     ax: Axes | None = None,
 ) -> Axes:
@@ -86,6 +102,14 @@ def plot_racetrack(
 
     Raises:
       ValueError: if a shape does not fit the racetrack, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> track = jaxhom.racetrack(["XXXX", "S..F", "XXXX"])
+      >>> plot_racetrack(track, values=np.arange(4.0)).get_ylabel()
+      'row'
     """
     board = board_of(racetrack, Racetrack)
     if values is not None:
@@ -95,8 +119,8 @@ def plot_racetrack(
 
 
 def plot_policy(
-    domain: Gridworld | Racetrack,
-    policy,
+    domain: Gridworld | Racetrack | TileMap,
+    policy: Float[ArrayLike, "S A"],
     *,
     speed: tuple[int, int] = (0, 0),
     color: str = INK,
@@ -109,7 +133,7 @@ def plot_policy(
     finish cells, where actions have no effect, have none.
 
     Args:
-      domain: a gridworld or a racetrack.
+      domain: a gridworld, a racetrack or a tile map.
       policy: [S, A], rows sum to 1.
       speed: racetrack only: the speed of the cars whose actions are drawn, standing ones if not
         given.
@@ -121,6 +145,14 @@ def plot_policy(
 
     Raises:
       ValueError: if a shape does not fit the domain, or there is no such speed.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> ax = plot_policy(world, np.full((16, 4), 0.25))
+      >>> ax.figure.savefig("/dev/null", format="png")
     """
     board = board_of(domain)
     policy = policy_at(board, policy, speed)
@@ -130,7 +162,7 @@ def plot_policy(
 
 
 def plot_trajectories(
-    domain: Gridworld | Racetrack,
+    domain: Gridworld | Racetrack | TileMap,
     trajectories: Demonstrations,
     *,
     color: str = VERMILLION,
@@ -144,7 +176,7 @@ def plot_trajectories(
     On a racetrack a line is cut where the car is put back from the finish to the start.
 
     Args:
-      domain: a gridworld or a racetrack.
+      domain: a gridworld, a racetrack or a tile map.
       trajectories: M trajectories of its model.
       color: of all of them.
       label: their name in a legend.
@@ -155,6 +187,14 @@ def plot_trajectories(
 
     Raises:
       ValueError: if a state does not exist in the domain.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 5], [3, 1, 1])])
+      >>> len(plot_trajectories(jaxhom.gridworld(4), walk).lines)
+      1
     """
     board = board_of(domain)
     trajectories.validate(board.mdp, "ignore")
@@ -162,7 +202,7 @@ def plot_trajectories(
     num = trajectories.num_trajectories
     offset = _SPREAD * (np.arange(num) - (num - 1) / 2) / max(num - 1, 1)
     width = 1.6 if num == 1 else 1.0
-    style = {"color": color, "linewidth": width, "marker": "o", "markersize": 1.0 + 1.6 * width}
+    style: dict[str, Any] = {"color": color, "linewidth": width, "marker": "o", "markersize": 1.0 + 1.6 * width}
     paths = [states // board.per_cell for states in unpadded(trajectories)]
     for m, path in enumerate(paths):
         ends = np.flatnonzero(~board.is_open[path]) + 1
@@ -176,8 +216,8 @@ def plot_trajectories(
 
 
 def plot_occupancy(
-    domain: Gridworld | Racetrack,
-    occupancy,
+    domain: Gridworld | Racetrack | TileMap,
+    occupancy: Float[ArrayLike, "S *A"],
     *,
     label: str = "expected discounted visits",
     ax: Axes | None = None,
@@ -185,7 +225,7 @@ def plot_occupancy(
     """Draws how often each cell is visited, as a heat map with a logarithmic colour bar.
 
     Args:
-      domain: a gridworld or a racetrack.
+      domain: a gridworld, a racetrack or a tile map.
       occupancy: [S, A] or [S], not negative: an occupancy measure, or counts. It is summed over
         actions, and over speeds on a racetrack. Cells below 1 / 10000 of the largest stay white;
         finish cells keep their chequers.
@@ -197,6 +237,15 @@ def plot_occupancy(
 
     Raises:
       ValueError: if the shape does not fit the domain, or no open cell is visited.
+
+    Outside jit, vmap and grad only: it draws concrete numbers.
+
+    Example:
+      >>> import jaxhom
+      >>> world = jaxhom.gridworld(4)
+      >>> visits = jaxhom.occupancy(world, np.full((16, 4), 0.25))
+      >>> plot_occupancy(world, visits).get_ylabel()
+      'row'
     """
     board = board_of(domain)
     shape = (board.num_states,)

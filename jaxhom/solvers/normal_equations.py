@@ -39,10 +39,11 @@ class Rows:
         matrix = scipy.sparse.csr_array(matrix)
         self.matrix, self.transpose, self.free_columns = _stored(matrix), _stored(matrix.T), free_columns
         core, others = matrix[:num_core], matrix[num_core:]
-        self._normal = _After(core, others)
+        self._normal: _Before | _After = _After(core, others)
         shared = (abs(others) @ abs(others).T).tocoo()
         if (shared.row == shared.col).all():
-            self._normal = min(_Before(core, others), self._normal, key=lambda normal: normal.work)
+            before = _Before(core, others)
+            self._normal = before if before.work <= self._normal.work else self._normal
         self.work = self._normal.work
 
     def factor(self, d: np.ndarray) -> None:

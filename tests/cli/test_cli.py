@@ -1,5 +1,6 @@
 """The command line as a whole: the main job, help, and one clear line for whatever is wrong with any command."""
 
+import dataclasses
 import pathlib
 import re
 import shlex
@@ -13,8 +14,10 @@ from cli_cases import LAKE, STATES, TRACK, Files
 from jaxhom import interop
 from jaxhom.apprenticeship.lpal import LPALSolution
 from jaxhom.cli import main_job
+from jaxhom.cli.methods import METHODS
 from jaxhom.cli.parser import main, make_parser
 from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.status import Status
 
 SMALL = ["--grid", "2", "--regions", "1", "--demonstrations", "1", "--sets", "1"]
 
@@ -45,6 +48,14 @@ def error_of(capsys, *arguments):
 # ----------------------------------------------------------------------------------------- the main job
 
 
+def uniform(problem, demonstrations, *_, **__):
+    return uniform_elsewhere(problem.mdp, demonstrations), {}
+
+
+def replace_method(monkeypatch, name, function):
+    monkeypatch.setitem(METHODS, name, dataclasses.replace(METHODS[name], function=function))
+
+
 def quick_methods(monkeypatch):
     """The job's table and picture without its long computations."""
 
@@ -54,12 +65,8 @@ def quick_methods(monkeypatch):
 
     monkeypatch.setattr(main_job, "lpal", lpal)
     monkeypatch.setattr(main_job, "feature_expectations", lambda mdp, policies: None)
-    monkeypatch.setattr(main_job, "soft_local_homomorphism", uniform_elsewhere)
-    methods = {
-        "soft local homomorphism": uniform_elsewhere,
-        "k-NN (hops)": lambda *problem: uniform_elsewhere(*problem),
-    }
-    monkeypatch.setattr(main_job, "GENERALIZATIONS", methods)
+    for name in ("soft-local-homomorphism", "nearest-neighbors"):
+        replace_method(monkeypatch, name, uniform)
 
 
 def test_main_job_prints_its_table(in_folder, monkeypatch, capsys):
@@ -79,15 +86,28 @@ def test_main_job_prints_its_table(in_folder, monkeypatch, capsys):
 def test_main_job_has_printed_what_was_finished(in_folder, monkeypatch, capsys):
     quick_methods(monkeypatch)
 
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(main_job.GENERALIZATIONS, "k-NN (hops)", interrupt)
+    replace_method(monkeypatch, "nearest-neighbors", interrupt)
     assert main([*SMALL, "--grid", "0", "--track", "a.track"]) == 130
     written = capsys.readouterr()
     assert "gridworld" not in written.out
     assert "\n  soft local homomorphism  " in written.out and "k-NN" not in written.out
     assert written.err == "jaxhom: interrupted\n"
+
+
+def test_main_job_says_what_did_not_end_as_asked(in_folder, monkeypatch, capsys):
+    quick_methods(monkeypatch)
+    quick = main_job.lpal
+    late = np.array([Status.ITERATION_LIMIT])
+    monkeypatch.setattr(main_job, "lpal", lambda *problem, **start: quick(*problem, **start).replace(status=late))
+    assert main([*SMALL, "--track", "a.track", "--picture", ""]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        f"jaxhom: warning: {title}, soft local homomorphism + LPAL: {Status.ITERATION_LIMIT.message}"
+        for title in ("gridworld 2x2, 1 regions, 10 demonstrations", "racetrack (a.track), 1 demonstrations")
+    ]
 
 
 def test_main_job_says_how_to_get_its_picture(in_folder, monkeypatch, capsys):

@@ -18,7 +18,7 @@ from jaxhom.interop import (
     from_samples,
     make_environment,
 )
-from jaxhom.interop.environments import require_steps_of_table
+from jaxhom.interop.environment_tables import require_steps_of_table
 from jaxhom.planning.optimal import optimal_policy
 
 DISCOUNT = 0.9

@@ -11,7 +11,7 @@ import scipy.stats
 import small_models
 from small_models import dense_transition
 
-from jaxhom.interop import SampledModel, from_mdptoolbox, from_samples, from_scipy
+from jaxhom.interop import ImportReport, SampledModel, from_gymnasium, from_mdptoolbox, from_samples, from_scipy
 
 # ------------------------------------------------------------------------------------- matrices
 
@@ -322,3 +322,15 @@ def test_bad_samples_are_refused(changes, message):
     columns = [arguments.pop(name) for name in ("states", "actions", "next_states")]
     with pytest.raises(ValueError, match=re.escape(message)):
         from_samples(*columns, **arguments)
+
+
+def test_results_are_short_when_printed():
+    lake = from_gymnasium("FrozenLake-v1", discount=0.99)
+    estimate = from_samples([0, 0], [0, 0], [1, 0], num_states=2, num_actions=1, discount=0.9)
+    report = ImportReport(episodes=1, steps=2, final_observations=0, dropped=((1, "it has no actions"),) * 100)
+    for result, parts in (
+        (lake, ["GymnasiumModel(", "num_states=16", "reward=float64[16,4]", "terminal=bool[16]"]),
+        (estimate, ["SampledModel(", "num_states=2", "count=int32[2,1]"]),
+        (report, ["ImportReport(episodes=1, steps=2, final_observations=0, dropped="]),
+    ):
+        assert all(part in repr(result) for part in parts) and len(repr(result)) < 400, repr(result)

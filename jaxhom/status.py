@@ -69,7 +69,7 @@ class Record:
             kinds[next((kind for kind in kinds if field.metadata.get(kind)), "data")].append(field.name)
         jax.tree_util.register_dataclass(cls, kinds["data"], kinds["static"], drop_fields=kinds["dropped"])
 
-    def replace(self, **changes) -> Self:
+    def replace(self, **changes: Any) -> Self:
         """Returns the record with the given fields exchanged."""
         return dataclasses.replace(self, **changes)
 

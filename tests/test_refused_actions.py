@@ -16,7 +16,6 @@ from jaxhom import (
 from jaxhom.models.graph import reachable_within
 from jaxhom.similarity.classes import local_model_classes
 from jaxhom.similarity.local_models import local_models
-from jaxhom.similarity.table import Relation
 
 
 def random_model(rng, num_states=5, num_actions=3):
@@ -101,6 +100,6 @@ def test_a_hub_is_left_open_and_costs_nothing(monkeypatch):
     found = local_similarity(mdp, [50, 3, 50], [3, 50, 50])
     assert found.status.tolist() == [1, 1, 0] and (found.upper[:2] == 1).all() and (found.lower[:2] == 0).all()
     table = SimilarityTable(mdp)
-    decisions = table.decisions([50, 3], [3, 4], Relation())
+    decisions = table.decisions([50, 3], [3, 4])
     assert decisions.similar.tolist() == [False, True]
     assert decisions.status.tolist() == [Status.ITERATION_LIMIT, Status.SOLVED]

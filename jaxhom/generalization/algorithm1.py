@@ -21,7 +21,7 @@ from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity.table import Relation, SimilarityTable, table_for
+from jaxhom.similarity.table import SimilarityTable, table_for
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def soft_local_homomorphism(
         table = similarity
     mdp = as_model(mdp)
     table = table_for(table, mdp, distance, anchored)
-    relation = Relation(threshold=threshold, mutual=mutual, tolerance=tolerance)
+    relation = {"threshold": threshold, "mutual": mutual, "tolerance": tolerance}
     start = uniform_elsewhere(mdp, demonstrations)
     asking = ~np.asarray(start.visited) & _asked(mdp, states)
     # All classes that will be met, at once: programs are as wide as the widest class that is known.
@@ -96,7 +96,7 @@ def soft_local_homomorphism(
         nonlocal status
         accepted = can_vote(state, expert)
         state, expert = state[accepted], expert[accepted]
-        found = table.decisions(state, expert, relation, progress=progress)
+        found = table.decisions(state, expert, **relation, progress=progress)
         accepted[accepted] = found.similar
         np.add.at(undecided, state, found.status != Status.SOLVED)
         status = max(status, found.status.max(initial=Status.SOLVED))
@@ -107,7 +107,7 @@ def soft_local_homomorphism(
         "undecided": checks.to_device(undecided, jnp.int32),
         "status": checks.to_device(np.asarray(status), jnp.int32),
     }
-    return extend(mdp, start, votes, ByHomomorphism(mdp, table, relation, asking), **ended)
+    return extend(mdp, start, votes, ByHomomorphism(mdp, table, asking, **relation), **ended)
 
 
 def _asked(mdp: MDP, states) -> np.ndarray:

@@ -15,7 +15,7 @@ from jaxhom.generalization.explanation import Explanation
 from jaxhom.generalization.votes import is_nearest, square_distances
 from jaxhom.models.graph import steps_from
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity.table import Relation, SimilarityTable
+from jaxhom.similarity.table import SimilarityTable
 
 LEAST_SHARE = 1e-3  # of the global map, for a demonstrated state to count as a voter
 
@@ -35,8 +35,10 @@ class ByHomomorphism:
 
     mdp: MDP
     table: SimilarityTable
-    relation: Relation
     asking: np.ndarray
+    threshold: float
+    mutual: bool
+    tolerance: float
 
     def __call__(self, general: Generalized, state: int) -> Explanation:
         if not self.asking[state]:
@@ -49,19 +51,20 @@ class ByHomomorphism:
         # Those nearer were refused when their ring was reached, or the search would have ended there.
         candidates = _experts(self.mdp, general, state)
         candidates = candidates[steps[candidates] == radius]
-        voters = candidates[self.table.decisions(np.full(len(candidates), state), candidates, self.relation).similar]
+        options = {"threshold": self.threshold, "mutual": self.mutual, "tolerance": self.tolerance}
+        voters = candidates[self.table.decide(np.full(len(candidates), state), candidates, **options)]
         here = np.full(len(voters), state)
         reason = f"{_voted(voters)}, {_steps(radius)} away.{_undecided(general, state)}"
         return dataclasses.replace(
             _mean_of(general, state, self._method(), reason, voters, steps[voters], mdp=self.mdp),
             forward=self.table.maps(here, voters),
-            backward=self.table.maps(voters, here) if self.relation.mutual else None,
+            backward=self.table.maps(voters, here) if self.mutual else None,
         )
 
     def _method(self) -> str:
         kind = "anchored" if self.table.anchored else "as printed"
-        both = ", both directions" if self.relation.mutual else ""
-        return f"Algorithm 1 (d = {self.table.distance}, epsilon = {self.relation.threshold:g}, {kind}{both})"
+        both = ", both directions" if self.mutual else ""
+        return f"Algorithm 1 (d = {self.table.distance}, epsilon = {self.threshold:g}, {kind}{both})"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ and its features are zero, and no policy may take it.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -137,7 +137,7 @@ class MDP(Record):
             restricts_actions=not allowed.all(),
         )
 
-    def replace(self, **changes) -> MDP:
+    def replace(self, **changes: Any) -> MDP:
         """Returns the model with the given arrays exchanged; usable under `jit`, `vmap` and `grad`.
 
         New numbers get the type of those that they replace, so that what was compiled for the model serves the new one

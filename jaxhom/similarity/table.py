@@ -6,7 +6,7 @@ same table, and bounds that were found for one threshold serve every other.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -28,14 +28,6 @@ if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Int
 
 _MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}  # below what an explanation prints
-
-
-class Relation(NamedTuple):
-    """When one state counts as similar to another; the fields are those arguments of `SimilarityTable.decide`."""
-
-    threshold: float = 0.0
-    mutual: bool = False
-    tolerance: float = 1e-4
 
 
 class Decisions(Record):
@@ -151,26 +143,28 @@ class SimilarityTable:
         Arguments, result and errors are those of `locally_similar`. Only pairs of classes that the bounds so far do not
         decide are solved.
         """
-        relation = Relation(threshold, mutual, tolerance)
-        return self.decisions(sources, targets, relation, progress=progress).similar
+        options = {"mutual": mutual, "tolerance": tolerance, "progress": progress}
+        return self.decisions(sources, targets, threshold, **options).similar
 
     def decisions(
         self,
         sources: Int[ArrayLike, " P"],
         targets: Int[ArrayLike, " P"],
-        relation: Relation,
+        threshold: float = 0.0,
         *,
+        mutual: bool = False,
+        tolerance: float = 1e-4,
         progress: bool = False,
     ) -> Decisions:
         """As `decide`, and says which of the pairs that count as different could not be decided, and why."""
-        goal = Goal.checked(tolerance=relation.tolerance, threshold=relation.threshold)
+        goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
         back = pairs[:, ::-1]
-        is_asked = ~self._is_far(back, goal) if relation.mutual else np.ones(len(pairs), bool)
+        is_asked = ~self._is_far(back, goal) if mutual else np.ones(len(pairs), bool)
         self._settle(pairs[is_asked], goal, progress)
         similar, is_far = is_asked & self._is_similar(pairs, goal), self._is_far(pairs, goal)
         status = self._known.look_up(pairs).status
-        if relation.mutual:
+        if mutual:
             self._settle(back[similar], goal, progress)
             is_far |= self._is_far(back, goal)
             status = np.where(similar, self._known.look_up(back).status, status)

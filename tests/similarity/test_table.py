@@ -9,7 +9,6 @@ import pytest
 from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar
 from jaxhom.similarity import class_pairs
 from jaxhom.similarity.local_models import local_models
-from jaxhom.similarity.table import Relation
 
 
 @functools.cache
@@ -89,11 +88,11 @@ def test_statuses_of_decisions(monkeypatch):
     table = SimilarityTable(model())
     sources, targets = SOURCES[[near, far]], TARGETS[[near, far]]
     threshold = optima()[near] - 1e-6  # just missed: takes many iterations to tell
-    found = table.decisions(sources, targets, Relation(threshold, tolerance=1e-9))
+    found = table.decisions(sources, targets, threshold, tolerance=1e-9)
     assert not found.similar.any() and found.status[0] == Status.ITERATION_LIMIT
     for mutual in (False, True):
-        assert table.decisions(sources, targets, Relation(1.0, mutual)).status.tolist() == [0, 0]
-    assert table.decisions([0], [0], Relation(mutual=True)).status.tolist() == [Status.SOLVED]
+        assert table.decisions(sources, targets, 1.0, mutual=mutual).status.tolist() == [0, 0]
+    assert table.decisions([0], [0], mutual=True).status.tolist() == [Status.SOLVED]
 
 
 def test_the_complete_table_decides_without_solving():

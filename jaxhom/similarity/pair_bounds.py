@@ -30,6 +30,10 @@ class PairBounds:
     def __len__(self) -> int:
         return len(self._key)
 
+    def pairs(self) -> np.ndarray:
+        """int [Q, 2]: those that have been met."""
+        return np.stack([self._key >> 32, self._key & 0xFFFFFFFF], axis=1)
+
     def look_up(self, pairs: np.ndarray) -> LocalSimilarity:
         """Bounds of pairs [P, 2]; the status is that of the last attempt that left the pair open, if there was one."""
         place = self._place(pairs)

@@ -217,6 +217,14 @@ class SimilarityTable:
             jax.tree.map(lambda leaf: leaf[where], bounds),
         )
 
+    def known(self) -> tuple[np.ndarray, LocalSimilarity]:
+        """All pairs of classes that were asked for, int [Q, 2], and the bounds on their errors, [Q].
+
+        The bounds are those of the models that stand for the classes. Numbers are those of `classes`.
+        """
+        pairs = self._known.pairs()
+        return pairs, self._known.look_up(pairs)
+
     def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool) -> None:
         """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before."""
         known = self._known.look_up(pairs)

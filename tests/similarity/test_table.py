@@ -97,7 +97,9 @@ def test_statuses_of_decisions(monkeypatch):
 
 def test_the_complete_table_decides_without_solving():
     table = SimilarityTable(gridworld(6)).complete(0.2)
-    assert table.num_classes == 9 and len(table._known) == 81
+    pairs, bounds = table.known()
+    assert table.num_classes == 9 and pairs.tolist() == [[i, j] for i in range(9) for j in range(9)]
+    assert np.all((bounds.lower > 0.2) | (bounds.upper <= 0.2 + 1e-4))
     solved = table.num_solved
     sources, targets = np.divmod(np.arange(36 * 36), 36)
     found = table.decide(sources, targets, 0.2, mutual=True)

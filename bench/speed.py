@@ -13,35 +13,37 @@ import pathlib
 import sys
 
 from bench import lpal_report, planning_report, similarity_report, speed_rows
+from bench.provenance import RESULTS
 
 KINDS = {"similarity": similarity_report.KIND, "lpal": lpal_report.KIND, "planning": planning_report.KIND}
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, writes rows after each of them, and reports."""
-    kind, path = KINDS[arguments.kind], arguments.output
+    kind, path, methods = KINDS[arguments.kind], arguments.output, arguments.methods
     if not arguments.report:
-        methods = getattr(arguments, "methods", None)
         wanted = arguments.sections or (kind.quick if arguments.quick else kind.sections)
-        stays = path.exists() and (arguments.sections or methods)
-        rows = speed_rows.read(path) if stays else []
+        rows = speed_rows.read(path) if path.exists() and (arguments.sections or methods) else []
+        options = ["--quick"] * arguments.quick
+        options += ["--methods", *methods] if methods else []
+        options += ["--limit", str(arguments.limit)] if arguments.limit else []
         for section in wanted:
             print(section, file=sys.stderr, flush=True)
             rows = speed_rows.replace_rows(rows, section, methods)
-            for row in speed_rows.measure(kind, section, _options(arguments)):
+            for row in speed_rows.measure(kind, section, options):
                 rows.append(row)
                 rows.sort(key=lambda row: kind.sections.index(row["section"]))
                 speed_rows.write(path, rows, kind.fields)
-    kind.report(speed_rows.read(path), path)
+    report(kind, path)
 
 
-def _options(arguments: argparse.Namespace) -> list[str]:
-    options = ["--quick"] * arguments.quick
-    if getattr(arguments, "methods", None):
-        options += ["--methods", *arguments.methods]
-    if getattr(arguments, "limit", None):
-        options += ["--limit", str(arguments.limit)]
-    return options
+def report(kind: speed_rows.Kind, path: pathlib.Path) -> None:
+    """The table and the figure, beside the CSV file."""
+    rows = speed_rows.read(path)
+    path.with_suffix(".md").write_text(kind.table(rows))
+    figure = kind.figure(rows)
+    if figure is not None:
+        figure.savefig(path.with_suffix(".png"), dpi=130)
 
 
 def main() -> None:
@@ -53,7 +55,8 @@ def main() -> None:
         command.add_argument("--quick", action="store_true", help="a few small instances, to see that it runs")
         command.add_argument("--sections", nargs="+", choices=kind.sections, help="only these; rows of others stay")
         command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
-        command.add_argument("--output", type=pathlib.Path, default=pathlib.Path(f"bench/results/speed_{name}.csv"))
+        command.add_argument("--output", type=pathlib.Path, default=RESULTS / f"speed_{name}.csv")
+        command.set_defaults(methods=None, limit=None)
         if kind.has_methods:
             command.add_argument("--methods", nargs="+", help="only those whose names begin so; rows of others stay")
             command.add_argument("--limit", type=float, help="seconds that a measurement may take")

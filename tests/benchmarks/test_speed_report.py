@@ -7,11 +7,11 @@ import time
 import numpy as np
 import pytest
 import scipy.optimize
+from bench.lpal_program import ConicProgram, Model, Program
 
 import jaxhom
 from bench import limits, lpal_report, planning_report, similarity_report, speed, speed_rows
 from bench.lpal_instances import INSTANCES, regions
-from bench.lpal_program import ConicProgram, Model, Program
 
 
 def lpal_row(method, lanes, seconds, section="grid16", states=256, **fields):

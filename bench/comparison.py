@@ -66,8 +66,8 @@ def table1_words(cells: pd.DataFrame, orders: Sequence[Order]) -> list[str]:
     counts = cells[(cells["verdict"] != "") & (cells["method"] != "expert")]["verdict"].value_counts()
     paragraphs = [
         f"Of {counts.sum()} printed ratios to the expert, {counts.get(AGREES, 0)} lie within our 95% interval, widened "
-        f"by the noise of the paper's 1000 trials; {counts.get(ONE_DRAW, 0)} lie outside it but among 95% of our single "
-        f"draws, of which the paper has one per row (†); {counts.get(DIFFERS, 0)} differ by more than that (*)."
+        f"by the noise of the paper's 1000 trials; {counts.get(ONE_DRAW, 0)} lie outside it but among 95% of our "
+        f"single draws, of which the paper has one per row (†); {counts.get(DIFFERS, 0)} differ by more than that (*)."
     ]
     paragraphs += [_cell_words(method, cells[cells["method"] == method]) for method in cells["method"].unique()]
     lost = [order for order in orders if order.ours.mean <= 0]

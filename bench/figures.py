@@ -4,8 +4,6 @@ Colours are those of Okabe and Ito (2008), and every curve has a marker and a li
 (numbers of samples) run through cividis.
 """
 
-from collections.abc import Iterable, Sequence
-
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd

@@ -1,9 +1,9 @@
 """Other solvers of linear programs: HiGHS, GLOP and PDLP of OR-tools, Clarabel, Moreau, MPAX.
 
 Each is a class of the protocol of `bench.processes`: made from `Settings` and what is given by keyword, it loads
-`LinearProgram`s (what is the same array as in the program before is not given again) and solves them into (z,
-multipliers). `opened` puts one together with what makes programs and reads solutions (`bench.linear_programs`); whether
-answers are any good is for a certificate to say. Only MPAX ever imports JAX.
+`LinearProgram`s (what is the same array as in the program before is not given again), and its solutions are (z,
+multipliers, its own word for how it ended). `Opened` puts one together with what makes programs and reads solutions
+(`bench.linear_programs`); whether answers are any good is for a certificate to say. Only MPAX ever imports JAX.
 """
 
 import dataclasses
@@ -43,7 +43,21 @@ class Settings:
         return " ".join(f"{name}: {value}" for name, value in (more | self.options).items())
 
 
-class Highs:
+class _OneByOne:
+    """Solvers of one program at a time: `start` with a matrix, `change` what has changed of the vectors."""
+
+    _lp: LinearProgram | None = None
+
+    def load(self, programs: list[LinearProgram]) -> None:
+        (lp,), last = programs, self._lp
+        self._lp = lp
+        if last is None or lp.matrix is not last.matrix:
+            self.start(lp)
+        else:
+            self.change(lp, last)
+
+
+class Highs(_OneByOne):
     """HiGHS: simplex, interior point with a crossover only where it gets stuck, or PDLP.
 
     `hot` simplex starts from the last program's solution.
@@ -52,7 +66,7 @@ class Highs:
     def __init__(self, solver: str, settings: Settings, *, threads: int, hot: bool = False, **_):
         import highspy
 
-        self._api, self._solver, self._lp, self._hot = highspy, highspy.Highs(), None, hot
+        self._api, self._solver, self._hot = highspy, highspy.Highs(), hot
         options, tolerance = highspy.HighsOptions(), max(settings.tolerance, 1e-10)  # the least that it takes
         options.output_flag, options.threads, options.solver = False, threads, solver
         options.primal_feasibility_tolerance = options.dual_feasibility_tolerance = tolerance
@@ -62,20 +76,7 @@ class Highs:
             setattr(options, name, value)
         self._solver.passOptions(options)
 
-    def load(self, programs: list[LinearProgram]) -> None:
-        """Passes the model, or what has changed of it."""
-        (lp,), last, solver = programs, self._lp, self._solver
-        self._lp = lp
-        if last is None or lp.matrix is not last.matrix:
-            solver.passModel(self._model(lp))
-            return
-        rows, columns = (np.arange(size, dtype=np.int32) for size in lp.matrix.shape)
-        if lp.right is not last.right:
-            solver.changeRowsBounds(len(rows), rows, lp.right, lp.row_upper)
-        if lp.cost is not last.cost:
-            solver.changeColsCost(len(columns), columns, lp.cost)
-
-    def _model(self, lp: LinearProgram):
+    def start(self, lp: LinearProgram) -> None:
         model = self._api.HighsLp()
         model.num_row_, model.num_col_ = lp.matrix.shape
         model.col_cost_, model.col_lower_, model.col_upper_ = lp.cost, lp.lower, lp.upper
@@ -83,10 +84,16 @@ class Highs:
         matrix = model.a_matrix_
         matrix.format_ = self._api.MatrixFormat.kRowwise
         matrix.start_, matrix.index_, matrix.value_ = lp.matrix.indptr, lp.matrix.indices, lp.matrix.data
-        return model
+        self._solver.passModel(model)
+
+    def change(self, lp: LinearProgram, last: LinearProgram) -> None:
+        rows, columns = (np.arange(size, dtype=np.int32) for size in lp.matrix.shape)
+        if lp.right is not last.right:
+            self._solver.changeRowsBounds(len(rows), rows, lp.right, lp.row_upper)
+        if lp.cost is not last.cost:
+            self._solver.changeColsCost(len(columns), columns, lp.cost)
 
     def solve(self, limit: float) -> list:
-        """The point, the multipliers, and HiGHS's own word for how it ended."""
         solver = self._solver
         if not self._hot:
             solver.clearSolver()
@@ -96,26 +103,22 @@ class Highs:
         return [(np.asarray(found.col_value), np.asarray(found.row_dual), word)]
 
 
-class Glop:
+class Glop(_OneByOne):
     """OR-tools' simplex code, on one thread."""
 
     def __init__(self, settings: Settings, **_):
         from ortools.linear_solver.python import model_builder_helper
 
-        self._api, self._lp = model_builder_helper, None
-        self._solver = self._api.ModelSolverHelper("glop")
+        self._api, self._solver = model_builder_helper, model_builder_helper.ModelSolverHelper("glop")
         names = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
         self._solver.set_solver_specific_parameters(settings.as_text(**dict.fromkeys(names, settings.tolerance)))
 
-    def load(self, programs: list[LinearProgram]) -> None:
-        """Makes the model, or changes what has changed of it."""
-        (lp,), last = programs, self._lp
-        self._lp = lp
-        if last is None or lp.matrix is not last.matrix:
-            self._model = self._api.ModelBuilderHelper()
-            bounds, matrix = (lp.right, lp.row_upper), scipy.sparse.csr_matrix(lp.matrix)
-            self._model.fill_model_from_sparse_data(lp.lower, lp.upper, lp.cost, *bounds, matrix)
-            return
+    def start(self, lp: LinearProgram) -> None:
+        self._model = self._api.ModelBuilderHelper()
+        bounds, matrix = (lp.right, lp.row_upper), scipy.sparse.csr_matrix(lp.matrix)
+        self._model.fill_model_from_sparse_data(lp.lower, lp.upper, lp.cost, *bounds, matrix)
+
+    def change(self, lp: LinearProgram, last: LinearProgram) -> None:
         for k in np.flatnonzero(lp.right != last.right).tolist():
             self._model.set_constraint_lower_bound(k, float(lp.right[k]))
             self._model.set_constraint_upper_bound(k, float(lp.row_upper[k]))
@@ -123,7 +126,6 @@ class Glop:
             self._model.set_var_objective_coefficient(k, float(lp.cost[k]))
 
     def solve(self, limit: float) -> list:
-        """The point, the multipliers and a status."""
         solver = self._solver
         solver.set_time_limit_in_seconds(limit)
         solver.solve(self._model)
@@ -132,7 +134,7 @@ class Glop:
         return [(np.asarray(solver.variable_values()), np.asarray(solver.dual_values()), str(solver.status()))]
 
 
-class OrtoolsPdlp:
+class OrtoolsPdlp(_OneByOne):
     """OR-tools' PDLP."""
 
     def __init__(self, settings: Settings, *, threads: int, **_):
@@ -140,55 +142,51 @@ class OrtoolsPdlp:
         from ortools.pdlp import solvers_pb2
         from ortools.pdlp.python import pdlp
 
-        self._api, self._qp, self._matrix = pdlp, pdlp.QuadraticProgram(), None
+        self._api, self._qp = pdlp, pdlp.QuadraticProgram()
         self._parameters = solvers_pb2.PrimalDualHybridGradientParams(num_threads=threads)
         criteria = self._parameters.termination_criteria.simple_optimality_criteria
         criteria.eps_optimal_absolute = criteria.eps_optimal_relative = settings.tolerance
         text_format.Merge(settings.as_text(), self._parameters)
 
-    def load(self, programs: list[LinearProgram]) -> None:
-        """Sets the program's arrays."""
-        (lp,), qp = programs, self._qp
-        if lp.matrix is not self._matrix:
-            self._matrix, qp.constraint_matrix = lp.matrix, scipy.sparse.csc_matrix(lp.matrix)
-        qp.objective_vector, qp.variable_lower_bounds, qp.variable_upper_bounds = lp.cost, lp.lower, lp.upper
-        qp.constraint_lower_bounds, qp.constraint_upper_bounds = lp.right, lp.row_upper
+    def start(self, lp: LinearProgram) -> None:
+        self._qp.constraint_matrix = scipy.sparse.csc_matrix(lp.matrix)
+        self._qp.variable_lower_bounds, self._qp.variable_upper_bounds = lp.lower, lp.upper
+        self.change(lp, lp)
+
+    def change(self, lp: LinearProgram, last: LinearProgram) -> None:
+        self._qp.objective_vector = lp.cost
+        self._qp.constraint_lower_bounds, self._qp.constraint_upper_bounds = lp.right, lp.row_upper
 
     def solve(self, limit: float) -> list:
-        """The point, the multipliers and a status."""
         self._parameters.termination_criteria.time_sec_limit = limit
         found = self._api.primal_dual_hybrid_gradient(self._qp, self._parameters)
         word = str(found.solve_log.termination_reason)
         return [(np.asarray(found.primal_solution), np.asarray(found.dual_solution), word)]
 
 
-class Clarabel:
+class Clarabel(_OneByOne):
     """Clarabel; its analysis of the matrix is kept from one program to the next."""
 
     def __init__(self, settings: Settings, *, threads: int, limit: float, **_):
         import clarabel
 
-        self._api, self._lp, self._settings = clarabel, None, clarabel.DefaultSettings()
+        self._api, self._settings = clarabel, clarabel.DefaultSettings()
         options = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), settings.tolerance)
         options |= {"verbose": False, "max_threads": threads, "time_limit": limit} | settings.options
         for name, value in options.items():
             setattr(self._settings, name, value)
 
-    def load(self, programs: list[LinearProgram]) -> None:
-        """Makes the solver, or changes its vectors."""
-        (lp,), last, api = programs, self._lp, self._api
-        self._lp = lp
-        if last is not None and lp.matrix is last.matrix:
-            self._solver.update(q=lp.cost, b=self._conic.right(lp))
-            return
-        self._conic = Conic(lp)
+    def change(self, lp: LinearProgram, last: LinearProgram) -> None:
+        self._solver.update(q=lp.cost, b=self._conic.right(lp))
+
+    def start(self, lp: LinearProgram) -> None:
+        self._conic, api = Conic(lp), self._api
         rows, columns = self._conic.matrix.shape
         cones = [api.ZeroConeT(self._conic.num_zero), api.NonnegativeConeT(rows - self._conic.num_zero)]
         quadratic, matrix = scipy.sparse.csc_matrix((columns, columns)), scipy.sparse.csc_matrix(self._conic.matrix)
         self._solver = api.DefaultSolver(quadratic, lp.cost, matrix, self._conic.right(lp), cones, self._settings)
 
     def solve(self, limit: float) -> list:
-        """The point, the multipliers and a status."""
         self._settings.time_limit = limit
         self._solver.update(settings=self._settings)
         found = self._solver.solve()
@@ -220,7 +218,6 @@ class Moreau:
         self._tolerance, self._limit, self._programs = settings.tolerance, limit, []
 
     def load(self, programs: list[LinearProgram]) -> None:
-        """Makes the solver, or keeps it; programs that share their matrix have it once."""
         import moreau
 
         last, self._programs = self._programs, programs
@@ -235,7 +232,6 @@ class Moreau:
             self._solver.setup(np.zeros((len(programs), 0)), np.stack([conic.values(lp) for lp in programs]))
 
     def solve(self, limit: float) -> list:
-        """Points, multipliers and statuses."""
         del limit
         costs, rights = ([read(lp) for lp in self._programs] for read in (lambda lp: lp.cost, self._conic.right))
         found = self._solver.solve(np.stack(costs), np.stack(rights))
@@ -259,7 +255,6 @@ class Mpax:
         self._pdhg, self._solve = algorithm(eps_abs=tolerance, eps_rel=tolerance, verbose=False, **options), None
 
     def load(self, programs: list[LinearProgram]) -> None:
-        """Stacks the arrays of programs of one structure."""
         self._lp = programs[0]
         if self._solve is None:
             self._solve = self._compiled(self._lp)
@@ -300,7 +295,6 @@ class Mpax:
         return lambda *stacked: jax.tree.map(lambda leaf: leaf[None], one(*(array[0] for array in stacked)))
 
     def solve(self, limit: float) -> list:
-        """Points, multipliers and statuses. It knows no time limit."""
         del limit
         points, found, words = map(np.asarray, self._solve(*self._vectors))
         multipliers, is_equation = np.empty(found.shape), self._lp.is_equation
@@ -335,10 +329,8 @@ class Opened:
         self._peer = PEERS[method][1](settings, **options)
 
     def load(self, lanes: list) -> None:
-        """Makes the lanes' programs, and has the peer load them."""
         self._peer.load([self._programs.given(lane) for lane in lanes])
 
     def solve(self, limit: float) -> list:
-        """Answers, the solver's words, and 0: iterations of different solvers cannot be compared."""
         solved = self._peer.solve(limit)
         return [(None if z is None else self._programs.read(z, y), word, 0) for z, y, word in solved]

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,9 +20,9 @@ from jaxhom import MDP, Status
 from jaxhom.similarity.homomorphism import ClassSimilarity
 from jaxhom.similarity.local_models import LocalModelClasses, local_model_classes
 
-_SIMILARITY_TOLERANCE = 1e-4
-_MONTE_CARLO_SHARE = 1e-3  # LPAL's gap as a share of what each of K regions gets of evenly spread time
-_MANY_FEATURES = 8  # from here on Monte Carlo's LPAL takes the interior-point method
+_SIMILARITY_TOLERANCE = 1e-4  # the library's default, which decisions shared by draws have to repeat
+_MONTE_CARLO_SHARE = 1e-3  # LPAL's gap as a share of what each of K regions gets of evenly spread time: no digit shown
+_MANY_FEATURES = 8  # grids have 16 and more, for which columns take long; racetracks two
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,10 +78,10 @@ def soft(problem: Problem, *, anchored: bool = True, mutual: bool = False) -> Le
 
 def _decisions(setting: Setting, model: MDP, anchored: bool) -> Decisions:
     """Decisions that all draws share, unless each has a model of its own."""
-    if setting.samples:
-        classes = local_model_classes(model, distance=setting.distance)
-        return Decisions(model, classes, setting.distance, anchored, _SIMILARITY_TOLERANCE, setting.threshold)
-    return _shared_decisions(setting.domain, setting.distance, setting.threshold, anchored)
+    if not setting.samples:
+        return _shared_decisions(setting.domain, setting.distance, setting.threshold, anchored)
+    classes = local_model_classes(model, distance=setting.distance)
+    return Decisions(model, classes, setting.distance, anchored, _SIMILARITY_TOLERANCE, setting.threshold)
 
 
 @functools.lru_cache(maxsize=32)
@@ -100,8 +101,7 @@ def generalize(function: Callable) -> Method:
 
     def method(problem: Problem) -> Learned:
         pairs = zip(problem.models, problem.demonstrations, strict=True)
-        found = [function(model, shown, problem.domain.coordinates) for model, shown in pairs]
-        return Learned(jnp.stack([general.policy for general in found]))
+        return Learned(jnp.stack([function(*pair, problem.domain.coordinates).policy for pair in pairs]))
 
     return method
 
@@ -114,12 +114,12 @@ euclidean_knn = generalize(
 regression = generalize(jaxhom.occupancy_regression)
 
 
-def apprentice(name: str, method: Method) -> Method:
+def apprentice(method: Method) -> Method:
     """LPAL on the feature expectations of a method's policies, started from them."""
 
     def learn(problem: Problem) -> Learned:
         mdp = problem.domain.mdp
-        policy = problem.once(name, lambda: method(problem)).policy
+        policy = problem.once(method).policy
         # `jaxhom.feature_expectations`, compiled once per domain and not once per number of features.
         expectations = jnp.einsum("bsa,sak->bk", jaxhom.occupancy(problem.domain.bare, policy), mdp.features)
         return _of_solution(mdp, jaxhom.lpal(mdp, expectations, initial_policy=policy))
@@ -130,16 +130,10 @@ def apprentice(name: str, method: Method) -> Method:
 def full_policy(problem: Problem) -> Learned:
     """LPAL on the expert's complete policy; solved once where all draws share it."""
     if problem.domain.weights is None:
-        return apprentice("expert", expert)(problem)
+        return apprentice(expert)(problem)
     mdp, policy = problem.domain.mdp, problem.expert.policy
-    expectations = jaxhom.feature_expectations(mdp, policy[:1])
-    learned = _of_solution(mdp, jaxhom.lpal(mdp, expectations, initial_policy=policy[:1]))
-    copies = len(policy)
-    return Learned(
-        jnp.broadcast_to(learned.policy, policy.shape),
-        np.repeat(learned.status, copies),
-        np.repeat(learned.certificate, copies),
-    )
+    solution = jaxhom.lpal(mdp, jaxhom.feature_expectations(mdp, policy[:1]), initial_policy=policy[:1])
+    return _of_solution(mdp, jax.tree.map(lambda leaf: jnp.repeat(leaf, len(policy), axis=0), solution))
 
 
 def monte_carlo(problem: Problem, *, per_step: bool = False) -> Learned:
@@ -162,37 +156,29 @@ def _of_solution(mdp, solution) -> Learned:
     return Learned(solution.policy, np.asarray(solution.status), np.asarray(gap))
 
 
-def plain(name: str, method: Method) -> Method:
-    """The method itself; its policies are kept for `apprentice(name, method)`."""
-    return lambda problem: problem.once(name, lambda: method(problem))
-
-
 TABLE1: dict[str, Method] = {
     "expert": expert,
     "full_policy": full_policy,
-    "soft_local_homomorphism": apprentice("soft", soft),
+    "soft_local_homomorphism": apprentice(soft),
     "monte_carlo": monte_carlo,
-    "maximum_entropy": apprentice("maximum_entropy", maximum_entropy),
-    "euclidean_knn": apprentice("euclidean_knn", euclidean_knn),
-    "regression": apprentice("regression", regression),
-    "manhattan_knn": apprentice("manhattan_knn", manhattan_knn),
+    "maximum_entropy": apprentice(maximum_entropy),
+    "euclidean_knn": apprentice(euclidean_knn),
+    "regression": apprentice(regression),
+    "manhattan_knn": apprentice(manhattan_knn),
 }
 """The columns of Table I, under the names of its file."""
-
+THRESHOLD: dict[str, Method] = {"expert": expert, "soft_local_homomorphism": soft, "manhattan_knn": manhattan_knn}
 FIGURE1: dict[str, Method] = {
     "expert": expert,
     "lpal_full_policy": full_policy,
-    "soft_local_homomorphism": plain("soft", soft),
+    "soft_local_homomorphism": soft,
     "soft_local_homomorphism_printed": functools.partial(soft, anchored=False),
     "soft_local_homomorphism_mutual": functools.partial(soft, mutual=True),
-    "manhattan_knn": plain("manhattan_knn", manhattan_knn),
-    "lpal_soft_local_homomorphism": apprentice("soft", soft),
-    "lpal_manhattan_knn": apprentice("manhattan_knn", manhattan_knn),
+    "manhattan_knn": manhattan_knn,
+    "lpal_soft_local_homomorphism": apprentice(soft),
+    "lpal_manhattan_knn": apprentice(manhattan_knn),
 }
 """The curves of Figure 1; Algorithm 1 also with the program as printed, and asking for similarity both ways."""
-
-THRESHOLD: dict[str, Method] = {"expert": expert, "soft_local_homomorphism": soft, "manhattan_knn": manhattan_knn}
-NOISE = THRESHOLD
 ENOUGH: dict[str, Method] = {**THRESHOLD, "maximum_entropy": maximum_entropy, "monte_carlo": monte_carlo}
 NORMALISATION: dict[str, Method] = {
     "monte_carlo": monte_carlo,

@@ -35,7 +35,8 @@ class Model:
     @classmethod
     def of(cls, mdp) -> "Model":
         """Of a `jaxhom.MDP`."""
-        features = sparse.csr_array(np.asarray(mdp.features, float).reshape(-1, mdp.num_features))
+        shape = (mdp.num_states * mdp.num_actions, mdp.num_features)
+        features = sparse.csr_array(np.asarray(mdp.features, float).reshape(shape))
         arrays = (np.asarray(mdp.next_state), np.asarray(mdp.probability, float))
         return cls(*arrays, features, np.asarray(mdp.initial, float), float(mdp.discount))
 
@@ -79,8 +80,9 @@ class Model:
 
     def policy_matrix(self, policy: np.ndarray) -> sparse.csr_array:
         """P of a policy [S, A], CSR [S, S]."""
-        pairs = np.arange(policy.size + 1)
-        averaged = sparse.csr_array((policy.flatten(), pairs[:-1], pairs[:: self.shape[1]]))
+        # Two index arrays: zeros are eliminated in place.
+        places, starts = np.arange(policy.size), np.arange(0, policy.size + 1, self.shape[1])
+        averaged = sparse.csr_array((policy.flatten(), places, starts))
         averaged.eliminate_zeros()
         return averaged @ self.transition
 

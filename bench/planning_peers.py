@@ -39,13 +39,11 @@ class MdpToolbox:
             self._options["eval_type"] = 0 if model.is_dense else 1  # its direct evaluation knows dense matrices only
 
     def load(self, lanes: list) -> None:
-        """A solver for the reward."""
         ((reward, _),) = lanes
         self._ready = self._solver(self._parts, reward, self._discount, **self._options)
         self._ready.max_iter = self._steps  # it makes a bound of its own, too small if epsilon is
 
     def solve(self, limit: float) -> list:
-        """The policy and the number of iterations."""
         del limit
         solver = copy.copy(self._ready)  # it would go on from its own answer
         solver.run()
@@ -66,7 +64,6 @@ class MdpSolver:
         self._arguments = {name: _nested(model, array) for name, array in lists.items()} | {"discount": model.discount}
 
     def load(self, lanes: list) -> None:
-        """A model with the reward."""
         ((reward, _),) = lanes
         self._ready = self._model()
         self._ready.mdp(rewards=reward.tolist(), **self._arguments)
@@ -79,7 +76,6 @@ class MdpSolver:
         return time.perf_counter() - start
 
     def solve(self, limit: float) -> list:
-        """The policy; it does not tell its iterations."""
         del limit
         self._ready.solve(**self._options, parallel=self._parallel)
         return [(np.asarray(self._ready.getPolicy()), "", 0)]
@@ -107,13 +103,11 @@ class QuantEcon:
             self._pairs = tuple(index.ravel() for index in np.indices(model.shape))
 
     def load(self, lanes: list) -> None:
-        """A problem with the reward."""
         ((reward, _),) = lanes
         reward = reward if self._is_dense else reward.ravel()
         self._ready = self._problem(reward, self._transition, self._discount, *self._pairs)
 
     def solve(self, limit: float) -> list:
-        """The policy and the number of iterations."""
         del limit
         found = self._ready.solve(**self._options)
         return [(np.asarray(found.sigma), "", int(found.num_iter))]
@@ -127,11 +121,9 @@ class LinearSolver:
         model.transition  # noqa: B018  (made once)
 
     def load(self, lanes: list) -> None:
-        """Nothing is made of a policy beforehand."""
         (self._lane,) = lanes
 
     def solve(self, limit: float) -> list:
-        """The occupancy or the values."""
         del limit
         reward, policy = self._lane
         is_occupancy = self._work == "occupancy"

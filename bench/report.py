@@ -15,11 +15,12 @@ import pandas as pd
 from bench import comparison, figures, summaries, tables
 from bench.provenance import RESULTS
 from bench.rows import Row, read_rows
+from bench.summaries import CONFIDENCE
 
 _WITHIN = 0.99  # of the expert's reward: enough
 _HEAD = f"""# Results
 
-Written by `python -m bench.report` from the rows in `raw/`. Intervals are {summaries.CONFIDENCE:.0%} confidence intervals of
+Written by `python -m bench.report` from the rows in `raw/`. Intervals are {CONFIDENCE:.0%} confidence intervals of
 means over draws, by Student's t; evaluation is exact, in trials of the demonstrations' length or the paper's. Ratios to
 the expert are taken draw by draw."""
 _FIGURE1_NOTE = """The paper prints no numbers for its Figure 1; what its text says of the curves is checked below. It

@@ -67,7 +67,7 @@ def grouped(rows: pd.DataFrame, *names: str):
 
 def paper_table1() -> dict[tuple[int, int, str], float]:
     """The printed numbers of Table I: (grid, regions, method) -> average reward per step."""
-    return pd.read_csv(PAPER, index_col=["grid", "regions"], float_precision="round_trip").stack().to_dict()
+    return pd.read_csv(PAPER, index_col=["grid", "regions"]).stack().to_dict()
 
 
 def table1(rows: Iterable[Row]) -> pd.DataFrame:
@@ -118,6 +118,13 @@ def figure1(rows: Iterable[Row]) -> pd.DataFrame:
 def question(rows: Iterable[Row]) -> pd.DataFrame:
     """One line per setting, method and metric."""
     return lines(rows, QUESTION_KEY, (*METRICS, "ratio"))
+
+
+def of_sweep(name: str, rows: Iterable[Row]) -> pd.DataFrame:
+    """The summary file of a sweep."""
+    if name == "table1":
+        return table1(rows)[list(TABLE1_COLUMNS)]
+    return figure1(rows) if name == "figure1" else question(rows)
 
 
 def lines(rows: Iterable[Row], by: Sequence[str], metrics: Sequence[str]) -> pd.DataFrame:

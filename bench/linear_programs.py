@@ -114,34 +114,29 @@ class Homomorphisms:
     """
 
     def __init__(self, source: np.ndarray, target: np.ndarray, anchored: bool):
-        self.shape = n, num_actions, m = (*source.shape[:2], len(target))
-        num_maps, num_rows, one = n * m, n * num_actions * m, source.size + target.size
-        # K's entries: row, column, and the number that stands there.
-        i, a, j = np.argwhere(source).T[:, :, None]
-        k = np.arange(m)
-        moved = ((i * num_actions + a) * m + k, j * m + k, (i * num_actions + a) * n + j)
-        i = np.arange(n)
-        target_state, a, k = np.argwhere(target).T[:, :, None]
-        entry = source.size + (target_state * num_actions + a) * m + k
-        mapped = ((i * num_actions + a) * m + k, i * m + target_state, entry)
-        blocks = [np.stack([part.ravel() for part in np.broadcast_arrays(*block)]) for block in (moved, mapped)]
-        sign = np.repeat([1.0, -1.0], [block.shape[1] for block in blocks])
-        rows, columns, entries = np.concatenate(blocks, axis=1)
-        maps, errors = np.arange(num_maps), np.arange(num_rows)
-        rows = np.concatenate([maps // m, n + rows, n + errors, n + num_rows + rows, n + num_rows + errors])
-        e = np.full(num_rows, num_maps)
-        columns = np.concatenate([maps, columns, e, columns, e])
-        factor = np.concatenate([np.ones(num_maps), -sign, np.ones(num_rows), sign, np.ones(num_rows)])
-        constant = np.full(num_rows, one)
-        entries = np.concatenate([np.full(num_maps, one), entries, constant, entries, constant])
-        places, slot = np.unique(rows * (num_maps + 1) + columns, return_inverse=True)
-        self.fill = sparse.csr_array((factor, (slot, entries)), shape=(len(places), one + 1))
-        indptr = np.searchsorted(places, np.arange(n + 2 * num_rows + 1) * (num_maps + 1))
+        self.shape = n, _, m = (*source.shape[:2], len(target))
+        num_maps, one = n * m, source.size + target.size + 1
+        # At first entries hold which number of (T, T', 1) they are, counted from 1, with its sign.
+        number, eye = np.arange(1.0, one), sparse.eye_array
+        moved = np.where(source, number[: source.size].reshape(source.shape), 0.0).reshape(-1, n)
+        mapped = np.where(target, -number[source.size :].reshape(target.shape), 0.0).transpose(1, 2, 0).reshape(-1, m)
+        parts = sparse.kron(moved, eye(m), "coo"), sparse.kron(eye(n), mapped, "coo")
+        data, rows, columns = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("data", "row", "col")
+        )
+        product = sparse.coo_array((data, (rows, columns)), shape=parts[0].shape)  # two numbers may meet
+        sums = sparse.kron(eye(n), np.full((1, m), float(one)))
+        e = sparse.coo_array(np.full((product.shape[0], 1), float(one)))
+        entries = sparse.block_array([[sums, None], [-product, e], [product, e]], format="coo")
+        places, slot = np.unique(entries.row.astype(int) * (num_maps + 1) + entries.col, return_inverse=True)
+        from_numbers = np.sign(entries.data), (slot, np.abs(entries.data).astype(int) - 1)
+        self.fill = sparse.csr_array(from_numbers, shape=(len(places), one))
+        indptr = np.searchsorted(places, np.arange(entries.shape[0] + 1) * (num_maps + 1))
         self._structure = (places % (num_maps + 1)).astype(np.int32), indptr.astype(np.int32)
         upper = np.full(num_maps + 1, np.inf)
         upper[1:m] = 0.0 if anchored else np.inf
         ends = {"lower": np.zeros(num_maps + 1), "upper": upper, "cost": np.append(np.zeros(num_maps), 1.0)}
-        right = np.append(np.ones(n), np.zeros(2 * num_rows))
+        right = np.append(np.ones(n), np.zeros(2 * product.shape[0]))
         self._rest = ends | {"right": right, "is_equation": right == 1.0}
 
     def given(self, pair: tuple[np.ndarray, np.ndarray]) -> LinearProgram:

@@ -134,7 +134,3 @@ def _margin(model: Model, policy: np.ndarray, expectations: np.ndarray) -> float
     """min_k V_k(policy) - Vhat_k of a policy [S, A]."""
     x = np.maximum(model.occupancy(policy), 0.0)
     return float((model.features.T @ x.ravel() - expectations).min())
-
-
-if __name__ == "__main__":
-    speed_rows.print_section(section, INSTANCES)

@@ -95,7 +95,3 @@ def _error(work: str, model: Model, lane: tuple, upper: np.ndarray, found: np.nd
         return float(np.abs(found - exact).sum() / exact.sum())
     exact = model.policy_value(policy, reward)
     return float(np.abs(found - exact).max() / np.abs(exact).max())
-
-
-if __name__ == "__main__":
-    speed_rows.print_section(section, TITLES)

@@ -16,14 +16,11 @@ import dataclasses
 import importlib
 import itertools
 import math
+import multiprocessing
 import os
-import pathlib
-import pickle
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
+from collections.abc import Iterator
 
 THREADS = 2  # the cores of the machine that the committed rows are from
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "RAYON_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -37,7 +34,7 @@ class NoAnswer(Exception):
     """Nothing to judge: `fields` say in a row why."""
 
     def __init__(self, status: str, note: str):
-        super().__init__(f"{status}: {note}")
+        super().__init__(status, note)
         self.fields = {"status": status, "note": note}
 
 
@@ -96,50 +93,77 @@ def measure(
     task = {"solver": solver, "options": options | {"threads": threads, "limit": limit}, "limit": limit}
     task |= {"package": package, "repeats": repeats, "compiles": compiles}
     with contextlib.ExitStack() as stack:
-        jobs = []
+        workers = []
         for share in shares:
             groups = [share] if together else [[lane] for lane in share]
-            jobs.append(stack.enter_context(_started(task | {"groups": groups}, threads)))
-        parts = [_result(*job, patience) for job in jobs]
-    return parts[0] if processes == 1 else _joined(parts)
-
-
-def _joined(parts: list[Found]) -> Found:
-    """One answer of processes that ran side by side: the slowest one's time, over all lanes."""
-    lists = [list(itertools.chain(*(getattr(part, name) for part in parts))) for name in ("answers", "words")]
-    iterations = [count for part in parts for count in part.iterations]
-    seconds = max(sum(part.seconds) for part in parts) / len(iterations)
+            worker = Worker("bench.processes", "run", task | {"groups": groups}, threads)
+            workers.append(stack.enter_context(contextlib.closing(worker)))
+        parts = [worker.receive(patience) for worker in workers]
+    if processes == 1:
+        return parts[0]
+    # The slowest one's time, over all lanes.
+    lists = [
+        list(itertools.chain(*(getattr(part, name) for part in parts))) for name in ("answers", "words", "iterations")
+    ]
+    seconds = max(sum(part.seconds) for part in parts) / len(lists[0])
     build, compile_s = (max(getattr(part, name) for part in parts) for name in ("build_s", "compile_s"))
-    return Found(*lists, iterations, [seconds] * len(iterations), build, compile_s, len(parts))
+    return Found(*lists, [seconds] * len(lists[0]), build, compile_s, processes)
 
 
-@contextlib.contextmanager
-def _started(task: dict, threads: int):
-    """A process at work on a task, and the folder that holds its files; both are gone afterwards."""
-    # OpenBLAS gains nothing from threads on what is factorised here, and loses much when it has to wait for one.
-    environment = os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads)) | {"OPENBLAS_NUM_THREADS": "1"}
-    with tempfile.TemporaryDirectory() as name:
-        folder = pathlib.Path(name)
-        (folder / "task").write_bytes(pickle.dumps(task))
-        with (folder / "log").open("w") as log:
-            command = [sys.executable, "-m", "bench.processes", name]
-            process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+class Worker:
+    """A process that iterates over `MODULE.FUNCTION(**arguments)`, and sends what it finds.
+
+    With a number of threads it is a silent one: solvers print.
+    """
+
+    def __init__(self, module: str, function: str, arguments: dict, threads: int | None = None):
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe(duplex=False)
+        self._process = context.Process(target=_work, args=(other, module, function, arguments, threads is not None))
+        self._start, before = time.perf_counter(), dict(os.environ)
+        if threads is not None:
+            # OpenBLAS gains nothing from threads on what is factorised here, and loses much when it waits for one.
+            os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(threads)) | {"OPENBLAS_NUM_THREADS": "1"})
+        self._process.start()
+        os.environ.clear()
+        os.environ.update(before)
+        other.close()
+
+    def receive(self, patience: float = math.inf):
+        """The next thing that it sends, until `patience` seconds after its start; None after the last.
+
+        Raises:
+          NoAnswer: if it failed, or is late.
+        """
+        left = max(patience - (time.perf_counter() - self._start), 0.0)
+        if not self._pipe.poll(None if math.isinf(left) else left):
+            raise NoAnswer("time limit", f"no answer in {patience:g} s")
         try:
-            yield process, folder, time.perf_counter()
-        finally:
-            process.kill()
-            process.wait()
+            found = self._pipe.recv()
+        except EOFError:
+            self._process.join()
+            raise NoAnswer("failed", f"exit code {self._process.exitcode}") from None
+        if isinstance(found, NoAnswer):
+            raise found
+        return found
+
+    def close(self) -> None:
+        """Ends the process, if it still runs."""
+        self._process.kill()
+        self._process.join()
 
 
-def _result(process, folder: pathlib.Path, start: float, patience: float) -> Found:
+def _work(pipe, module: str, function: str, arguments: dict, is_silent: bool) -> None:
+    """The other side."""
+    if is_silent:
+        for stream in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     try:
-        code = process.wait(max(patience - (time.perf_counter() - start), 0.0))
-    except subprocess.TimeoutExpired:
-        raise NoAnswer("time limit", f"no answer in {patience:g} s") from None
-    if code or not (folder / "result").exists():
-        lines = (folder / "log").read_text(errors="replace").strip().splitlines() or [""]
-        raise NoAnswer("failed", f"exit code {code}: {lines[-1][:200]}")
-    return pickle.loads((folder / "result").read_bytes())
+        for found in getattr(importlib.import_module(module), function)(**arguments):
+            pipe.send(found)
+        pipe.send(None)
+    except Exception as error:  # whatever a solver raises is for a row to say
+        pipe.send(NoAnswer("failed", f"{type(error).__name__}: {error}"[:200]))
 
 
 def timed(call, repeats: int = _REPEATS, *, wait: float = math.inf, enough: float = math.inf) -> tuple:
@@ -162,8 +186,8 @@ def timed(call, repeats: int = _REPEATS, *, wait: float = math.inf, enough: floa
 
 def run(
     solver: str, options: dict, groups: list[list], limit: float, package: str, repeats: int, compiles: bool
-) -> Found:
-    """Opens a solver, and has it load and solve group after group; to be called in a process of its own."""
+) -> Iterator[Found]:
+    """Opens a solver, and has it load and solve group after group; in a process of its own."""
     module, name = solver.split(":")
     opened = getattr(importlib.import_module(f"bench.{module}"), name)
     importlib.import_module(package)
@@ -186,15 +210,4 @@ def run(
         build, slowest = build + build_s, max(slowest, median)
         answers += getattr(found, "read", list)(solved)
         seconds += [median / len(group)] * len(group)
-    return Found(*map(list, zip(*answers, strict=True)), seconds, build, compile_s)
-
-
-def main() -> None:
-    """The other side: reads the task, and writes what is found."""
-    folder = pathlib.Path(sys.argv[1])
-    found = run(**pickle.loads((folder / "task").read_bytes()))
-    (folder / "result").write_bytes(pickle.dumps(found))
-
-
-if __name__ == "__main__":
-    importlib.import_module("bench.processes").main()  # what is pickled must not be of __main__
+    yield Found(*map(list, zip(*answers, strict=True)), seconds, build, compile_s)

@@ -1,7 +1,6 @@
 """Measures the similarity engine and its peers on the same instances, judged by the same certificate.
 
-Each section runs in a process of its own (`python -m bench.similarity_speed SECTION`), so that a first call there is
-cold, compilation included. Every time of ours is the median of three calls after a first one; `compile_s` is what the
+Each section runs in a process of its own, so that a first call there is cold, compilation included. Every time of ours is the median of three calls after a first one; `compile_s` is what the
 first took beyond them. Peers are measured as `bench.processes` says, and what they spend on building their programs
 counts.
 """
@@ -378,7 +377,3 @@ def section(name: str, quick: bool, methods: None, limit: None) -> Iterator[dict
     """All rows of a section."""
     del methods, limit
     yield from SECTIONS[name](quick)
-
-
-if __name__ == "__main__":
-    speed_rows.print_section(section, SECTIONS)

@@ -24,9 +24,7 @@ def run(arguments: argparse.Namespace) -> None:
     if not arguments.report:
         wanted = arguments.sections or (kind.quick if arguments.quick else kind.sections)
         rows = speed_rows.read(path) if path.exists() and (arguments.sections or methods) else []
-        options = ["--quick"] * arguments.quick
-        options += ["--methods", *methods] if methods else []
-        options += ["--limit", str(arguments.limit)] if arguments.limit else []
+        options = {"quick": arguments.quick, "methods": methods, "limit": arguments.limit}
         for section in wanted:
             print(section, file=sys.stderr, flush=True)
             rows = speed_rows.replace_rows(rows, section, methods)

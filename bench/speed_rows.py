@@ -1,14 +1,13 @@
 """Rows of the benchmarks of speed: measured section by section, kept as CSV. Never imports JAX."""
 
-import argparse
+import contextlib
 import csv
 import dataclasses
-import json
 import pathlib
-import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 
+from bench.processes import NoAnswer, Worker
 from bench.provenance import provenance as provenance  # what every row ends with
 
 
@@ -18,7 +17,7 @@ class Kind:
 
     Attributes:
       title: for the command line's help.
-      module: `python -m bench.MODULE SECTION [--quick]` prints the rows of a section, each a line "ROW {json}".
+      module: its `section(name, quick, methods, limit)` measures the rows of a section.
       sections: all of them, in the order of the file; quick: those of a quick run.
       fields: the columns.
       shown: the fields that are printed while it runs.
@@ -37,29 +36,16 @@ class Kind:
     has_methods: bool = False
 
 
-def measure(kind: Kind, section: str, options: list[str]) -> Iterator[dict]:
+def measure(kind: Kind, section: str, options: dict) -> Iterator[dict]:
     """Rows of one section, measured in a process of its own; a section that fails is a row too."""
-    command = [sys.executable, "-m", f"bench.{kind.module}", section, *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        for line in process.stdout:
-            if line.startswith("ROW "):
-                row = {"section": section} | json.loads(line.removeprefix("ROW "))
+    arguments = {"name": section} | options
+    with contextlib.closing(Worker(f"bench.{kind.module}", "section", arguments)) as worker:
+        try:
+            while (row := worker.receive()) is not None:
                 print("  ", *(_short(row.get(name, "")) for name in kind.shown), file=sys.stderr, flush=True)
-                yield row
-    if process.returncode:
-        yield {"section": section, "status": "failed", "note": f"exit code {process.returncode}"}
-
-
-def print_section(section: Callable[..., Iterator[dict]], names: Iterable[str]) -> None:
-    """The other side, the command line of a section's process: prints its rows."""
-    parser = argparse.ArgumentParser(description=print_section.__doc__)
-    parser.add_argument("section", choices=sorted(names))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--methods", nargs="+")
-    parser.add_argument("--limit", type=float)
-    arguments = parser.parse_args()
-    for row in section(arguments.section, arguments.quick, arguments.methods, arguments.limit):
-        print("ROW " + json.dumps(row), flush=True)
+                yield {"section": section} | row
+        except NoAnswer as error:
+            yield {"section": section} | error.fields
 
 
 def read(path: pathlib.Path) -> list[dict]:

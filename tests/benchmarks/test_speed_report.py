@@ -226,21 +226,21 @@ def here(monkeypatch, request):
 @pytest.mark.parametrize("together", [False, True])
 def test_lanes_come_back_in_order_with_their_times(together, here):
     groups = [[1, 2, 3]] if together else [[1], [2], [3]]
-    found = processes.run("doubling:Doubling", {"seconds": 0.02}, groups, 10.0, "numpy", 3, False)
+    (found,) = processes.run("doubling:Doubling", {"seconds": 0.02}, groups, 10.0, "numpy", 3, False)
     assert (found.answers, found.words, found.iterations) == ([2, 4, 6], ["done"] * 3, [1] * 3)
     assert found.seconds == pytest.approx([0.02 / len(groups[0])] * 3, rel=0.5)
     assert found.build_s < 0.01 and found.processes == 1
 
 
 def test_lanes_that_the_limit_leaves_no_time_for_are_left_out(here):
-    found = processes.run("doubling:Doubling", {"seconds": 0.2}, [[1], [2], [3]], 0.3, "numpy", 0, False)
+    (found,) = processes.run("doubling:Doubling", {"seconds": 0.2}, [[1], [2], [3]], 0.3, "numpy", 0, False)
     assert found.answers == [2]
 
 
 def test_processes_share_lanes_and_are_ended_at_their_limit():
     pairs = random_pairs(np.random.default_rng(0), 3, 2, 2)
     shared = {"method": "numpy solve", "work": "policy_value", "model": None}
-    with pytest.raises(processes.NoAnswer, match="failed: exit code 1: AttributeError"):
+    with pytest.raises(processes.NoAnswer, match="AttributeError"):
         processes.measure("planning_peers:opened", shared, pairs, 60.0, processes=2)
     start = time.perf_counter()
     with pytest.MonkeyPatch.context() as patch, pytest.raises(processes.NoAnswer, match="time limit"):

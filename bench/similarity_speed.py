@@ -1,8 +1,8 @@
 """Measures the similarity engine and its peers on the same instances, judged by the same certificate.
 
-Each section runs in a process of its own, so that a first call there is cold, compilation included. Every time of ours is the median of three calls after a first one; `compile_s` is what the
-first took beyond them. Peers are measured as `bench.processes` says, and what they spend on building their programs
-counts.
+Each section runs in a process of its own, so that a first call there is cold, compilation included. Every time of ours
+is the median of three calls after a first one; `compile_s` is what the first took beyond them. Peers are measured as
+`bench.processes` says, and what they spend on building their programs counts.
 """
 
 import functools

@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.processes import Found, NoAnswer, measure
 
-LIMIT, QUICK_LIMIT = 300.0, 60.0  # seconds for a row: a section takes a night at most
+LIMIT, QUICK_LIMIT = 300.0, 60.0  # seconds for a row, so that all of them take hours and not days
 LANES, QUICK_LANES = 32, 4
 SINGLE_LANES, QUICK_SINGLE_LANES = 3, 1
 _FEWER_LANES = (8, 2)  # of a peer's batch that would take too long
@@ -55,6 +55,11 @@ class Contest:
             fields["iterations"] = int(np.median(found.iterations))
         fields |= {"processes": found.processes, "note": ", ".join(sorted(set(found.words) - {""}))}
         return fields | {"status": "measured"} | self.judge(found.answers)
+
+
+def matches(method: str, wanted: list[str] | None) -> bool:
+    """Whether a method's name begins with one of those that are wanted (all, if None)."""
+    return wanted is None or method.startswith(tuple(wanted))
 
 
 def our_row(contest: Contest, method: str, solver: str, options: dict, batch: bool, device: str) -> dict:

@@ -14,12 +14,7 @@ from bench.speed_report import (
     shown,
     sorted_curves,
 )
-from bench.speed_rows import Kind
 
-SECTIONS = (  # the instances, small ones first
-    *("grid16", "grid16_exact", "grid16_monte_carlo", "grid24", "bumps24", "grid32", "grid48", "grid48_exact"),
-    *("grid48_monte_carlo", "garnet", "racetrack_a", "racetrack_b", "bumps48", "grid100", "grid316"),
-)
 OVER_STATES = ("grid16", "grid24", "grid32", "grid48", "grid100", "grid316")  # one family: the figure's points
 _HEADER = "| method | one, s | gap | against best peer | batch | each, s | gap | against best peer | compile s |"
 
@@ -79,20 +74,3 @@ def figure(rows: list[dict]) -> Figure | None:
     """Seconds per lane against states."""
     panel = ("LPAL to a certified gap of 1e-5 per step, two cores", curves(rows))
     return over_states([panel], (7.2, 5.6)) if panel[1] else None
-
-
-KIND = Kind(
-    title="LPAL, against other LP solvers",
-    module="lpal_speed",
-    sections=SECTIONS,
-    quick=("grid16", "racetrack_b"),
-    fields=(
-        *("section", "instance", "S", "A", "K", "lanes", "method", "processes", "dtype", "device"),
-        *("seconds", "compile_s", "build_s", "gap_asked", "gap_certified", "settled", "iterations"),
-        *("status", "note", "versions", "commit"),
-    ),
-    shown=("method", "lanes", "seconds", "settled", "status", "note"),
-    table=table,
-    figure=figure,
-    has_methods=True,
-)

@@ -16,11 +16,12 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import contest, lp_peers, speed_rows  # noqa: E402
+from bench import contest, lp_peers  # noqa: E402
 from bench.linear_programs import Lpal  # noqa: E402
 from bench.lp_peers import Settings  # noqa: E402
 from bench.lpal_instances import INSTANCES  # noqa: E402
 from bench.models import Model  # noqa: E402
+from bench.provenance import provenance  # noqa: E402
 
 OURS = {"jaxhom": None, "jaxhom interior_point": "interior_point", "jaxhom flow": "flow"}
 _PRIMAL_SIMPLEX = {"simplex_strategy": 4, "presolve": "off"}
@@ -60,11 +61,11 @@ _PACKAGES = ("jax", "moreau", "clarabel", "highspy", "ortools", "mpax", "scipy")
 def section(name: str, quick: bool, methods: list[str] | None, limit: float | None) -> Iterator[dict]:
     """All rows of an instance: ours, then each peer's."""
     problem, model = _drawn(name, quick, limit)
-    for method in filter(lambda method: speed_rows.matches(method, methods), OURS):
+    for method in filter(lambda method: contest.matches(method, methods), OURS):
         for batch in (False, True) if OURS[method] is None else (False,):
             options = {"name": name, "method": OURS[method]}
             yield contest.our_row(problem, method, "ours:lpal", options, batch, jax.default_backend())
-    for method in filter(lambda method: speed_rows.matches(method, methods), CANDIDATES):
+    for method in filter(lambda method: contest.matches(method, methods), CANDIDATES):
         if lp_peers.is_installed(method):
             yield from contest.peer_rows(problem, _peer(method, model))
         else:
@@ -78,7 +79,7 @@ def _drawn(name: str, quick: bool, limit: float | None) -> tuple[contest.Contest
     model = Model.of(mdp)
     gap = 1e-5 / (1.0 - model.discount) * float(jnp.abs(mdp.features).max())
     fields = {"instance": INSTANCES[name].title, "S": mdp.num_states, "A": mdp.num_actions, "K": mdp.num_features}
-    fields |= {"dtype": "float64", "gap_asked": gap} | speed_rows.provenance(*_PACKAGES)
+    fields |= {"dtype": "float64", "gap_asked": gap} | provenance(*_PACKAGES)
 
     def judge(answers: list) -> dict:
         gaps = [certified_gap(mdp, model, *pair, gap) for pair in zip(answers, expectations, strict=False)]

@@ -9,7 +9,9 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import gmres, splu
 
 _DENSE = 0.25  # share of entries that are not 0, from which on a full matrix takes less time than its sparse factors
-_SCATTERED = 0.1  # mean distance of a state's successors in the best order, as a share of all states: 0.01 on grids
+# Mean distance of a state's successors in the best order, as a share of all states: 0.02 on a 48 x 48 grid, 0.06 on
+# racetrack (a), 0.32 for random successors.
+_SCATTERED = 0.1
 _MIN_SCATTERED = 2000  # states; smaller factors are cheap even if they fill up
 _GMRES = 1e-12
 _MAX_RESIDUAL = 1e-11  # relative; a thousandth of the smallest error that rows ask for

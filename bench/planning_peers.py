@@ -5,15 +5,14 @@ keyword. A lane is a reward and a policy, both [S, A]; answers are policies as a
 [S].
 """
 
-import copy
 import importlib.util
-import time
 
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
 from bench.models import Model
+from bench.processes import timed
 
 _MAX_ITERATIONS = 1_000_000  # more than any instance needs
 _MAX_STEPS = {"policy_iteration": 1000, "modified_policy_iteration": 100}  # of mdptoolbox; more than it needs
@@ -45,9 +44,8 @@ class MdpToolbox:
 
     def solve(self, limit: float) -> list:
         del limit
-        solver = copy.copy(self._ready)  # it would go on from its own answer
-        solver.run()
-        return [(np.asarray(solver.policy), "", int(solver.iter))]
+        self._ready.run()
+        return [(np.asarray(self._ready.policy), "", int(self._ready.iter))]
 
 
 class MdpSolver:
@@ -65,15 +63,17 @@ class MdpSolver:
 
     def load(self, lanes: list) -> None:
         ((reward, _),) = lanes
+        if self._parallel is None:
+            seconds = {parallel: self._seconds(reward, parallel) for parallel in (True, False)}
+            self._parallel = min(seconds, key=seconds.get)
         self._ready = self._model()
         self._ready.mdp(rewards=reward.tolist(), **self._arguments)
-        if self._parallel is None:
-            self._parallel = self._seconds(True) < self._seconds(False)
 
-    def _seconds(self, parallel: bool) -> float:
-        start = time.perf_counter()
-        self._ready.solve(**self._options, parallel=parallel)
-        return time.perf_counter() - start
+    def _seconds(self, reward: np.ndarray, parallel: bool) -> float:
+        self._ready = self._model()
+        self._ready.mdp(rewards=reward.tolist(), **self._arguments)
+        _, seconds, _ = timed(lambda: self._ready.solve(**self._options, parallel=parallel), 0)
+        return seconds
 
     def solve(self, limit: float) -> list:
         del limit

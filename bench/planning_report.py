@@ -14,7 +14,6 @@ from bench.speed_report import (
     shown,
     sorted_curves,
 )
-from bench.speed_rows import Kind
 
 SECTIONS = ("grid16", "grid32", "grid48", "grid100", "grid316", "racetrack_a", "garnet_dense", "garnet_sparse")
 WORKS = {
@@ -64,20 +63,3 @@ def figure(rows: list[dict]) -> Figure | None:
     """Seconds per lane against the grids' states, a panel for each kind of work."""
     panels = [(title, found) for work, title in WORKS.items() if (found := curves(rows, work))]
     return over_states(panels, (5.2 * len(panels), 5.0)) if panels else None
-
-
-KIND = Kind(
-    title="planning and occupancies, against MDP toolboxes and SciPy",
-    module="planning_speed",
-    sections=SECTIONS,
-    quick=("grid16", "garnet_sparse"),
-    fields=(
-        *("section", "instance", "work", "S", "A", "lanes", "method", "processes", "dtype", "device"),
-        *("seconds", "compile_s", "build_s", "error_asked", "error", "settled", "iterations"),
-        *("status", "note", "versions", "commit"),
-    ),
-    shown=("work", "method", "lanes", "seconds", "settled", "status", "note"),
-    table=table,
-    figure=figure,
-    has_methods=True,
-)

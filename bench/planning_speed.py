@@ -16,16 +16,17 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import contest, planning_peers, speed_rows  # noqa: E402
+from bench import contest, planning_peers  # noqa: E402
 from bench.lp_peers import Settings  # noqa: E402
 from bench.models import Model  # noqa: E402
 from bench.planning_instances import TITLES, build, rewards  # noqa: E402
+from bench.provenance import provenance  # noqa: E402
 
 OURS = "jaxhom"
 SEED = 0
-_LOSS = 1e-6  # per step, as a share of the largest reward: no policy that differs visibly has less
+_LOSS = 1e-6  # per step, as a share of the largest reward: a tenth of what LPAL is asked for
 _LEAST_TOLERANCE = 1e-10  # of toolboxes, times the largest value: below it float64 ends
-_RELATIVE_ERROR = 1e-8  # what a backward stable solve has on the worst instance, with room
+_RELATIVE_ERROR = 1e-8  # direct solves have 1e-12 at the worst (results/speed_planning.csv); for iterative ones
 _MIXED = 0.1  # of the uniform policy, in the policies that are evaluated: every state occurs
 _PACKAGES = ("jax", "mdptoolbox-hiive", "mdpsolver", "quantecon", "scipy", "numpy")
 
@@ -47,20 +48,20 @@ def section(name: str, quick: bool, methods: list[str] | None, limit: float | No
     for work in ("planning", "occupancy", "policy_value"):
         asked = loss if work == "planning" else _RELATIVE_ERROR
         fields = {"instance": TITLES[name], "work": work, "S": mdp.num_states, "A": mdp.num_actions}
-        fields |= {"dtype": "float64", "error_asked": asked} | speed_rows.provenance(*_PACKAGES)
+        fields |= {"dtype": "float64", "error_asked": asked} | provenance(*_PACKAGES)
         judge = functools.partial(_judged, work, model, lanes, upper, asked)
         problem = contest.Contest(fields, lanes, single, limit, judge, least)
         yield from _rows(problem, name, work, model, loss, methods)
 
 
 def _rows(problem, name: str, work: str, model: Model, loss: float, methods: list[str] | None) -> Iterator[dict]:
-    if speed_rows.matches(OURS, methods):
+    if contest.matches(OURS, methods):
         # The loss of the greedy policy is at most twice the Bellman residual over 1 - discount.
         options = {"name": name, "work": work, "tolerance": 0.5 * (1.0 - model.discount) * loss}
         for batch in (False, True):
             yield contest.our_row(problem, OURS, "ours:planning", options, batch, jax.default_backend())
     for method in planning_peers.PLANNERS if work == "planning" else planning_peers.SOLVERS:
-        if not speed_rows.matches(method, methods) or not planning_peers.can_solve(method, model):
+        if not contest.matches(method, methods) or not planning_peers.can_solve(method, model):
             continue
         if not planning_peers.is_installed(method):
             yield problem.row(method, 1, status="not installed")

@@ -5,6 +5,8 @@
     solver.solve(seconds)          [(answer, the solver's word, iterations), ...], one for each of these lanes;
                                    a solver with `read(solution)` makes this list of its solution untimed
 
+A lane is loaded again before it is solved again: some solvers would go on from their own answer.
+
 Opening and loading are building (`build_s`); what a first solve takes beyond the next is compiling (`compile_s`); the
 rest is `seconds`. Every measurement has a process of its own, with a number of threads and a time limit: solvers differ
 in whether they keep to a limit, in what they leave in memory and in which threads they start, and a process that can be
@@ -13,6 +15,7 @@ ended settles all three. Its end closes the solver.
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 import itertools
 import math
@@ -26,7 +29,7 @@ THREADS = 2  # the cores of the machine that the committed rows are from
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "RAYON_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _START_UP = 60.0  # seconds to import, build and compile, beyond the limit
 _REPEATS = 3  # an odd number, for the median
-_ENOUGH_SECONDS = 0.5  # of repetitions of a lane: from then on its noise is below a few percent
+_ENOUGH_SECONDS = 0.5  # of repetitions of a lane, so that they cost little
 _SHARE_OF_REPEATS = 0.1  # of the limit: a lane that takes longer is not repeated, so that all fit in
 
 
@@ -166,10 +169,11 @@ def _work(pipe, module: str, function: str, arguments: dict, is_silent: bool) ->
         pipe.send(NoAnswer("failed", f"{type(error).__name__}: {error}"[:200]))
 
 
-def timed(call, repeats: int = _REPEATS, *, wait: float = math.inf, enough: float = math.inf) -> tuple:
+def timed(call, repeats: int = _REPEATS, *, wait: float = math.inf, enough: float = math.inf, between=None) -> tuple:
     """(result, seconds of the first call, median of the next ones, or the first's if there are none).
 
     A first call of more than `wait` seconds is not repeated; more than `enough` seconds of repetitions are not needed.
+    `between()` comes before each of them, untimed.
     """
 
     def once():
@@ -179,6 +183,8 @@ def timed(call, repeats: int = _REPEATS, *, wait: float = math.inf, enough: floa
 
     (result, first), later = once(), []
     while first <= wait and len(later) < repeats and sum(later) <= enough:
+        if between is not None:
+            between()
         result, seconds = once()
         later.append(seconds)
     return result, first, statistics.median(later or [first])
@@ -201,10 +207,12 @@ def run(
         left = limit - (time.perf_counter() - start)
         if answers and slowest > left:
             break
-        _, build_s, _ = timed(lambda group=group: found.load(group), 0)
+        load = functools.partial(found.load, group)
+        _, build_s, _ = timed(load, 0)
         # A lane that need not be solved twice is repeated only where that costs nothing.
         wait = limit if compiles else enough if answers else _SHARE_OF_REPEATS * limit
-        solved, first, median = timed(lambda left=left: found.solve(left), repeats, wait=wait, enough=enough)
+        solve = functools.partial(found.solve, left)
+        solved, first, median = timed(solve, repeats, wait=wait, enough=enough, between=load)
         if not answers:
             compile_s = max(first - median, 0.0)
         build, slowest = build + build_s, max(slowest, median)

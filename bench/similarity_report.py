@@ -4,7 +4,6 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 from bench.speed_report import Points, finish, is_ours, is_settled, least, line, number, shown, sorted_curves, style
-from bench.speed_rows import Kind
 
 _MIN_SETTLED = 0.98  # a method that leaves more pairs open is not compared
 _PEAK = ("peak", "one PDHG iteration")  # work of another table
@@ -91,22 +90,3 @@ def figure(rows: list[dict]) -> Figure | None:
     all_axes[0].set_ylabel("milliseconds per pair")
     figure.suptitle("Certified brackets of 1e-4, random pairs with 4 actions, two cores")
     return figure
-
-
-KIND = Kind(
-    title="local and global homomorphisms, against other LP solvers",
-    module="similarity_speed",
-    sections=(
-        *("peak", "brackets", "counts", "decisions", "gradients", "peers"),
-        *("racetrack", "algorithm1", "global", "global_large"),
-    ),
-    quick=("brackets", "decisions", "gradients", "peers"),
-    fields=(
-        *("section", "work", "n", "m", "actions", "pairs", "method", "dtype", "device", "devices", "processes"),
-        *("gap_asked", "gap_certified", "settled", "compile_s", "build_s", "seconds", "ms_per_pair"),
-        *("gflops", "peak_fraction", "gbytes_per_s", "status", "note", "versions", "commit"),
-    ),
-    shown=("work", "method", "dtype", "n", "pairs", "ms_per_pair"),
-    table=table,
-    figure=figure,
-)

@@ -16,10 +16,11 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import lp_peers, speed_rows  # noqa: E402
+from bench import lp_peers  # noqa: E402
 from bench.linear_programs import Conic, Homomorphisms  # noqa: E402
 from bench.lp_peers import Settings  # noqa: E402
 from bench.processes import Found, NoAnswer, measure, timed  # noqa: E402
+from bench.provenance import provenance  # noqa: E402
 from jaxhom.generalization.global_lp import GlobalHomomorphismProblem  # noqa: E402
 from jaxhom.similarity.brackets import bracket_errors  # noqa: E402
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem  # noqa: E402
@@ -28,7 +29,7 @@ from jaxhom.solvers import pdhg  # noqa: E402
 
 NUM_ACTIONS = 4
 GAP = 1e-4  # the library's default tolerance
-THRESHOLD = 0.05
+THRESHOLD = 0.05  # which some of the random pairs of five states are within, and some are not
 GLOBAL_GAP = 1e-3  # HiGHS takes minutes for a tenth of it
 SIZES = (3, 5, 8, 13, 25)  # 5 is a cell of a grid and its neighbours, 13 and 25 what is two and three steps away
 OUR_PAIRS = {3: 2048, 5: 2048, 8: 512, 13: 128, 25: 32}
@@ -57,7 +58,7 @@ def row(work: str, method: str, pairs: int, seconds: float | None = None, **fiel
     base |= {"devices": jax.device_count(), "processes": 1, "dtype": "float64", "status": "measured"}
     if seconds is not None:
         base |= {"seconds": seconds, "ms_per_pair": 1e3 * seconds / max(pairs, 1)}
-    return base | speed_rows.provenance(*_PACKAGES) | fields
+    return base | provenance(*_PACKAGES) | fields
 
 
 def ready(call):

@@ -24,7 +24,7 @@ from bench.rows import KEY, Row, RowFile
 from bench.settings import Setting
 from jaxhom import Status
 
-BATCH = 50  # draws: half of Table I's, so that two batches keep two cores busy
+BATCH = 50  # draws: all of a point of Figure 1, and half of a row of Table I
 _NUM_TRIALS = 1000  # as many as the paper's
 _BAR = "{desc}{percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
 

@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 import jaxhom
-from bench import lp_peers, lpal_report, planning_report, processes, similarity_report, speed, speed_rows
+from bench import lp_peers, lpal_report, planning_report, processes, speed
 from bench.linear_programs import Conic, Homomorphisms, Lpal
 from bench.lp_peers import Settings
 from bench.lpal_instances import INSTANCES, regions
@@ -39,12 +39,12 @@ LPAL_ROWS = [
 @pytest.fixture
 def lpal_path(tmp_path):
     path = tmp_path / "rows.csv"
-    speed_rows.write(path, LPAL_ROWS, lpal_report.KIND.fields)
+    speed.write(path, LPAL_ROWS, speed.KINDS["lpal"].fields)
     return path
 
 
 def test_ratios_are_to_the_best_settled_peer_of_the_same_column(lpal_path):
-    rows = speed_rows.read(lpal_path)
+    rows = speed.read(lpal_path)
     best = lpal_report.best_peers(rows)
     assert best == {("grid16", False): 0.4, ("grid16", True): 0.1, ("grid48", False): 9.0, ("grid48", True): 9.0}
     table = lpal_report.table(rows)
@@ -56,7 +56,7 @@ def test_ratios_are_to_the_best_settled_peer_of_the_same_column(lpal_path):
 
 
 def test_curves_hold_settled_rows_by_states(lpal_path):
-    found = lpal_report.curves(speed_rows.read(lpal_path))
+    found = lpal_report.curves(speed.read(lpal_path))
     assert found["jaxhom", False] == [(256, 0.2), (2304, 3.0)]
     assert found["moreau", True] == [(256, 0.1)]
     assert not any(method in ("clarabel", "mpax") for method, _ in found)
@@ -72,7 +72,7 @@ def test_report_writes_table_and_figure(kind, lpal_path, tmp_path, monkeypatch):
             for work, lanes, method in itertools.product(planning_report.WORKS, (1, 32), ("jaxhom", "another"))
         ]
         path = tmp_path / "planning.csv"
-        speed_rows.write(path, rows, planning_report.KIND.fields)
+        speed.write(path, rows, speed.KINDS["planning"].fields)
     monkeypatch.setattr("sys.argv", ["speed", kind, "--report", "--output", str(path)])
     speed.main()
     text = path.with_suffix(".md").read_text()
@@ -82,12 +82,12 @@ def test_report_writes_table_and_figure(kind, lpal_path, tmp_path, monkeypatch):
 
 def test_rows_of_other_sections_and_methods_stay():
     rows = [lpal_row("jaxhom", 1, 1.0), lpal_row("glop", 1, 1.0), lpal_row("jaxhom", 1, 1.0, "grid48")]
-    assert speed_rows.replace_rows(rows, "grid16", None) == rows[2:]
-    assert speed_rows.replace_rows(rows, "grid16", ["jaxhom"]) == rows[1:]
+    assert speed.replace_rows(rows, "grid16", None) == rows[2:]
+    assert speed.replace_rows(rows, "grid16", ["jaxhom"]) == rows[1:]
 
 
 def test_kinds_name_their_sections():
-    assert set(lpal_report.SECTIONS) == set(INSTANCES)
+    assert set(speed.KINDS["lpal"].sections) == set(INSTANCES)
     assert set(lpal_report.OVER_STATES) <= set(INSTANCES)
     for kind in speed.KINDS.values():
         assert set(kind.quick) <= set(kind.sections) and len(set(kind.fields)) == len(kind.fields)
@@ -96,7 +96,7 @@ def test_kinds_name_their_sections():
 def test_committed_rows_have_the_fields(request):
     path = request.config.rootpath / "bench" / "results" / "speed_similarity.csv"
     with path.open(newline="") as file:
-        assert set(csv.DictReader(file).fieldnames) == set(similarity_report.KIND.fields)
+        assert set(csv.DictReader(file).fieldnames) == set(speed.KINDS["similarity"].fields)
 
 
 # ----------------------------------------------------------------------------------------------------------- programs

@@ -12,13 +12,14 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
 import numpy as np
 
 from bench.processes import Found, NoAnswer, measure
 
-LIMIT, QUICK_LIMIT = 300.0, 60.0  # seconds for a row, so that all of them take hours and not days
+_LIMIT, _QUICK_LIMIT = 300.0, 60.0  # seconds for a row, so that all of them take hours and not days
 LANES, QUICK_LANES = 32, 4
-SINGLE_LANES, QUICK_SINGLE_LANES = 3, 1
+_SINGLE_LANES, _QUICK_SINGLE_LANES = 3, 1
 _FEWER_LANES = (8, 2)  # of a peer's batch that would take too long
 _ONE_THREAD = 1.5  # a peer's lane on one thread may take so much longer than on two
 _FIRST_SHARE = 0.2  # of the limit, for the first of several candidates
@@ -31,18 +32,28 @@ class Contest:
 
     Attributes:
       fields: of every row.
-      lanes: what solvers load. single: how many of them are solved one by one.
-      limit: seconds for one row.
+      lanes: what solvers load.
       judge: (answers) -> fields that say how accurate they are, "settled" among them.
       least_tolerance: that peers are given.
+      quick: whether it is to take minutes, not hours.
+      limit: seconds for one row, or None for what is usual.
     """
 
     fields: dict
     lanes: list
-    single: int
-    limit: float
     judge: Callable[[list], dict]
-    least_tolerance: float = 0.0
+    least_tolerance: float
+    quick: bool
+    limit: float | None
+
+    def __post_init__(self):
+        if self.limit is None:
+            object.__setattr__(self, "limit", _QUICK_LIMIT if self.quick else _LIMIT)
+
+    @property
+    def single(self) -> int:
+        """How many lanes are solved one by one."""
+        return min(len(self.lanes), _QUICK_SINGLE_LANES if self.quick else _SINGLE_LANES)
 
     def row(self, method: str, lanes: int, **fields) -> dict:
         """One row of the table; what is not given stays empty."""
@@ -62,7 +73,24 @@ def matches(method: str, wanted: list[str] | None) -> bool:
     return wanted is None or method.startswith(tuple(wanted))
 
 
-def our_row(contest: Contest, method: str, solver: str, options: dict, batch: bool, device: str) -> dict:
+def rows(contest: Contest, ours: dict, peers: dict, methods: list[str] | None) -> Iterator[dict]:
+    """All rows of those methods that are wanted: ours, then each peer's.
+
+    Args:
+      ours: by method (solver, options, whether it has a row for a batch).
+      peers: by method; None if it is not installed.
+    """
+    for method, (solver, options, has_batch) in ours.items():
+        for batch in (False, True)[: 1 + has_batch] if matches(method, methods) else ():
+            yield _our_row(contest, method, solver, options, batch)
+    for method, peer in peers.items():
+        if matches(method, methods) and peer is None:
+            yield contest.row(method, 1, status="not installed")
+        elif matches(method, methods):
+            yield from _peer_rows(contest, method, peer)
+
+
+def _our_row(contest: Contest, method: str, solver: str, options: dict, batch: bool) -> dict:
     """A row of this library."""
     lanes = contest.lanes if batch else contest.lanes[: contest.single]
     try:
@@ -72,7 +100,7 @@ def our_row(contest: Contest, method: str, solver: str, options: dict, batch: bo
             fields["note"] += f", took longer than {contest.limit:g} s"
     except NoAnswer as error:
         fields = _late(contest, error)
-    return contest.row(method, len(lanes) if batch else 1, **fields | {"device": device})
+    return contest.row(method, len(lanes) if batch else 1, **fields | {"device": jax.default_backend()})
 
 
 def _late(contest: Contest, error: NoAnswer, settings: str = "") -> dict:
@@ -86,14 +114,13 @@ class Peer:
     """A peer in a contest.
 
     Attributes:
-      method: its name. solver, package: see `bench.processes.measure`.
+      solver, package: see `bench.processes.measure`.
       options: settings -> options.
       candidates: settings, each with a `tolerance`; the best of them is taken.
       together: whether it solves a batch at once. is_hot: in a batch it starts from the lane before.
       both_cores: whether it uses them by itself.
     """
 
-    method: str
     solver: str
     package: str
     options: Callable[[Any], dict]
@@ -103,16 +130,16 @@ class Peer:
     both_cores: bool = False
 
 
-def peer_rows(contest: Contest, peer: Peer) -> Iterator[dict]:
+def _peer_rows(contest: Contest, method: str, peer: Peer) -> Iterator[dict]:
     """A peer's rows; its batch is as large as the time limit lets expect, and has the tolerance that the single had."""
     fields, settings = _best(contest, peer)
-    yield contest.row(peer.method, 1, **fields)
+    yield contest.row(method, 1, **fields)
     if not fields.get("settled"):
         return
     expected = _ONE_THREAD * (fields["seconds"] + fields["build_s"] / contest.single) / 2.0
     for lanes in (len(contest.lanes), *_FEWER_LANES):
         if lanes * expected <= contest.limit:
-            yield contest.row(peer.method, lanes, **_batch_fields(contest, peer, settings, lanes))
+            yield contest.row(method, lanes, **_batch_fields(contest, peer, settings, lanes))
             return
 
 

@@ -59,21 +59,7 @@ _PACKAGES = ("jax", "moreau", "clarabel", "highspy", "ortools", "mpax", "scipy")
 
 
 def section(name: str, quick: bool, methods: list[str] | None, limit: float | None) -> Iterator[dict]:
-    """All rows of an instance: ours, then each peer's."""
-    problem, model = _drawn(name, quick, limit)
-    for method in filter(lambda method: contest.matches(method, methods), OURS):
-        for batch in (False, True) if OURS[method] is None else (False,):
-            options = {"name": name, "method": OURS[method]}
-            yield contest.our_row(problem, method, "ours:lpal", options, batch, jax.default_backend())
-    for method in filter(lambda method: contest.matches(method, methods), CANDIDATES):
-        if lp_peers.is_installed(method):
-            yield from contest.peer_rows(problem, _peer(method, model))
-        else:
-            yield problem.row(method, 1, status="not installed")
-
-
-def _drawn(name: str, quick: bool, limit: float | None) -> tuple[contest.Contest, Model]:
-    """The instance, with `jaxhom.lpal`'s default tolerance as the gap that is asked for."""
+    """All rows of an instance, with `jaxhom.lpal`'s default tolerance as the gap that is asked for."""
     lanes = contest.QUICK_LANES if quick else OUR_LANES.get(name, contest.LANES)
     mdp, expectations = INSTANCES[name].draw(SEED, lanes)
     model = Model.of(mdp)
@@ -82,22 +68,23 @@ def _drawn(name: str, quick: bool, limit: float | None) -> tuple[contest.Contest
     fields |= {"dtype": "float64", "gap_asked": gap} | provenance(*_PACKAGES)
 
     def judge(answers: list) -> dict:
-        gaps = [certified_gap(mdp, model, *pair, gap) for pair in zip(answers, expectations, strict=False)]
-        worst = max(gaps)
+        worst = max(certified_gap(mdp, model, *pair, gap) for pair in zip(answers, expectations, strict=False))
         return {"gap_certified": worst if np.isfinite(worst) else None, "settled": float(worst <= gap)}
 
-    single = min(lanes, contest.QUICK_SINGLE_LANES if quick else contest.SINGLE_LANES)
-    limit = limit or (contest.QUICK_LIMIT if quick else contest.LIMIT)
-    return contest.Contest(fields, list(expectations), single, limit, judge, _LEAST_TOLERANCE), model
+    problem = contest.Contest(fields, list(expectations), judge, _LEAST_TOLERANCE, quick, limit)
+    ours = {key: ("ours:lpal", {"name": name, "method": method}, method is None) for key, method in OURS.items()}
+    peers = {method: _peer(method, model) for method in CANDIDATES}
+    yield from contest.rows(problem, ours, peers, methods)
 
 
-def _peer(method: str, model: Model) -> contest.Peer:
+def _peer(method: str, model: Model) -> contest.Peer | None:
     def options(settings: Settings) -> dict:
         make = functools.partial(Lpal, model, settings.form, settings.shares)
         return {"method": method, "settings": settings, "make": make}
 
+    if not lp_peers.is_installed(method):
+        return None
     return contest.Peer(
-        method=method,
         solver="lp_peers:Opened",
         package=lp_peers.PEERS[method][0],
         options=options,

@@ -42,41 +42,32 @@ def section(name: str, quick: bool, methods: list[str] | None, limit: float | No
     ]
     upper = [np.asarray(plan.upper_bound(mdp)) for plan in plans]
     loss = _LOSS / (1.0 - model.discount) * float(np.abs(drawn).max())
-    single = contest.QUICK_SINGLE_LANES if quick else contest.SINGLE_LANES
-    limit = limit or (contest.QUICK_LIMIT if quick else contest.LIMIT)
-    least = _LEAST_TOLERANCE * loss / _LOSS
+    # The loss of the greedy policy is at most twice the Bellman residual over 1 - discount.
+    options = {"name": name, "tolerance": 0.5 * (1.0 - model.discount) * loss}
     for work in ("planning", "occupancy", "policy_value"):
         asked = loss if work == "planning" else _RELATIVE_ERROR
         fields = {"instance": TITLES[name], "work": work, "S": mdp.num_states, "A": mdp.num_actions}
         fields |= {"dtype": "float64", "error_asked": asked} | provenance(*_PACKAGES)
         judge = functools.partial(_judged, work, model, lanes, upper, asked)
-        problem = contest.Contest(fields, lanes, single, limit, judge, least)
-        yield from _rows(problem, name, work, model, loss, methods)
+        problem = contest.Contest(fields, lanes, judge, _LEAST_TOLERANCE * loss / _LOSS, quick, limit)
+        ours = {OURS: ("ours:planning", options | {"work": work}, True)}
+        yield from contest.rows(problem, ours, _peers(work, model, loss), methods)
 
 
-def _rows(problem, name: str, work: str, model: Model, loss: float, methods: list[str] | None) -> Iterator[dict]:
-    if contest.matches(OURS, methods):
-        # The loss of the greedy policy is at most twice the Bellman residual over 1 - discount.
-        options = {"name": name, "work": work, "tolerance": 0.5 * (1.0 - model.discount) * loss}
-        for batch in (False, True):
-            yield contest.our_row(problem, OURS, "ours:planning", options, batch, jax.default_backend())
-    for method in planning_peers.PLANNERS if work == "planning" else planning_peers.SOLVERS:
-        if not contest.matches(method, methods) or not planning_peers.can_solve(method, model):
-            continue
-        if not planning_peers.is_installed(method):
-            yield problem.row(method, 1, status="not installed")
-            continue
-        shared = {"method": method, "work": work, "model": model}
-        yield from contest.peer_rows(
-            problem,
-            contest.Peer(
-                method=method,
+def _peers(work: str, model: Model, loss: float) -> dict[str, contest.Peer | None]:
+    """The toolboxes, or the linear solvers, which have no tolerance."""
+    is_planning, peers = work == "planning", {}
+    for method in planning_peers.PLANNERS if is_planning else planning_peers.SOLVERS:
+        if planning_peers.can_solve(method, model):
+            shared = {"method": method, "work": work, "model": model}
+            peer = contest.Peer(
                 solver="planning_peers:opened",
                 package=planning_peers.package(method),
                 options=lambda settings, shared=shared: shared | {"tolerance": settings.tolerance},
-                candidates=(Settings(loss if work == "planning" else 0.0),),
-            ),
-        )
+                candidates=(Settings(loss if is_planning else 0.0),),
+            )
+            peers[method] = peer if planning_peers.is_installed(method) else None
+    return peers
 
 
 def _judged(work: str, model: Model, lanes: list, upper: list, asked: float, answers: list) -> dict:

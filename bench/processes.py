@@ -28,6 +28,7 @@ from collections.abc import Iterator
 THREADS = 2  # the cores of the machine that the committed rows are from
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "RAYON_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _START_UP = 60.0  # seconds to import, build and compile, beyond the limit
+_GOODBYE = 10.0  # seconds for a process to end that has answered
 _REPEATS = 3  # an odd number, for the median
 _ENOUGH_SECONDS = 0.5  # of repetitions of a lane, so that they cost little
 _SHARE_OF_REPEATS = 0.1  # of the limit: a lane that takes longer is not repeated, so that all fit in
@@ -121,6 +122,7 @@ class Worker:
 
     def __init__(self, module: str, function: str, arguments: dict, threads: int | None = None):
         context = multiprocessing.get_context("spawn")
+        self._is_heard = False
         self._pipe, other = context.Pipe(duplex=False)
         self._process = context.Process(target=_work, args=(other, module, function, arguments, threads is not None))
         self._start, before = time.perf_counter(), dict(os.environ)
@@ -148,10 +150,12 @@ class Worker:
             raise NoAnswer("failed", f"exit code {self._process.exitcode}") from None
         if isinstance(found, NoAnswer):
             raise found
+        self._is_heard = True
         return found
 
     def close(self) -> None:
-        """Ends the process, if it still runs."""
+        """Ends the process, at once if it is late, else once it has put its things away."""
+        self._process.join(_GOODBYE if self._is_heard else 0.0)
         self._process.kill()
         self._process.join()
 

@@ -67,7 +67,8 @@ def grouped(rows: pd.DataFrame, *names: str):
 
 def paper_table1() -> dict[tuple[int, int, str], float]:
     """The printed numbers of Table I: (grid, regions, method) -> average reward per step."""
-    return pd.read_csv(PAPER, index_col=["grid", "regions"]).stack().to_dict()
+    printed = pd.read_csv(PAPER, index_col=["grid", "regions"])
+    return {(*row, method): value for method, column in printed.items() for row, value in column.items()}
 
 
 def table1(rows: Iterable[Row]) -> pd.DataFrame:

@@ -56,7 +56,7 @@ def soft(problem: Problem, *, anchored: bool = True, mutual: bool = False) -> Le
 
 
 def excess_of(table: SimilarityTable, threshold: float) -> float:
-    """By how much the error of a pair that counts as similar may exceed epsilon; of all pairs that the table has met."""
+    """By how much the error of a pair that counts as similar may exceed epsilon, of all that the table has met."""
     upper = table.known()[1].upper
     return float((upper[upper <= threshold + _SIMILARITY_TOLERANCE] - threshold).max(initial=0.0))
 

@@ -4,16 +4,23 @@ The checks run in NumPy on concrete arrays, in the constructors and at the doors
 code never checks values. Shapes are reported as expected against actual.
 """
 
+from __future__ import annotations
+
 import operator
 import reprlib
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
+if TYPE_CHECKING:
+    from jax.typing import DTypeLike
+    from jaxtyping import Array, Bool, Float, Int, Num, Shaped
+
 MAX_SLOTS = 2**31 - 2  # flat indices of the solvers are int32, and one is the padding's
 
 
-def as_host_array(name: str, value) -> np.ndarray:
+def as_host_array(name: str, value: Any) -> np.ndarray:
     """Returns `value` as a NumPy array; explains itself if called on a traced value."""
     if isinstance(value, jax.core.Tracer):
         raise ValueError(
@@ -27,7 +34,7 @@ def as_host_array(name: str, value) -> np.ndarray:
         raise ValueError(f"{name} is not a rectangular array: {reason}") from None
 
 
-def to_device(array, dtype=None) -> jax.Array:
+def to_device(array: Any, dtype: DTypeLike | None = None) -> Array:
     """A JAX array of its own memory; float64 is float32 unless x64 is on.
 
     `jnp.asarray` compiles a program for every new shape of NumPy arrays, which takes longer than most of what is done
@@ -38,23 +45,25 @@ def to_device(array, dtype=None) -> jax.Array:
     return jax.device_put(np.array(array, dtype))
 
 
-def is_traced(*trees) -> bool:
+def is_traced(*trees: Any) -> bool:
     """True if any leaf of the given pytrees is a traced value (host checks are then impossible)."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def in_one_line(value) -> str:
+def in_one_line(value: Any) -> str:
     """`repr` for messages: without line breaks, and cut off where it is long."""
     return " ".join(reprlib.repr(value).split())
 
 
-def require_shape(name: str, array, expected: str, condition: bool) -> None:
+def require_shape(name: str, array: Any, expected: str, condition: bool) -> None:
     """Raises unless `condition`; `expected` describes the shape in words."""
     if not condition:
         raise ValueError(f"{name} must have shape {expected}, got {tuple(np.shape(array))}")
 
 
-def require_all(name: str, array: np.ndarray, good: np.ndarray, message: str, remark: str = "") -> None:
+def require_all(
+    name: str, array: Shaped[np.ndarray, "*N *X"], good: Bool[np.ndarray, "*N"], message: str, remark: str = ""
+) -> None:
     """Raises with the first index where `good` (same leading axes as `array`) is false; `remark` ends the message."""
     if not np.all(good):
         index = tuple(int(i) for i in np.argwhere(~good)[0])
@@ -63,7 +72,7 @@ def require_all(name: str, array: np.ndarray, good: np.ndarray, message: str, re
         raise ValueError(f"{name}{where} {message}, got {value}{remark}")
 
 
-def require_floats(name: str, array: np.ndarray) -> np.ndarray:
+def require_floats(name: str, array: Shaped[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
     """Returns `array` as floating point of at most 64 bits; rejects NaN, infinity, text."""
     if array.dtype.kind not in "iubf":
         raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
@@ -73,7 +82,7 @@ def require_floats(name: str, array: np.ndarray) -> np.ndarray:
     return array
 
 
-def require_floats_in(dtype, name: str, array: np.ndarray) -> np.ndarray:
+def require_floats_in(dtype: DTypeLike, name: str, array: Shaped[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
     """Returns `array` as floats of the given type; rejects, beside NaN and so on, what overflows there."""
     array = require_floats(name, array)
     with np.errstate(over="ignore"):
@@ -82,7 +91,7 @@ def require_floats_in(dtype, name: str, array: np.ndarray) -> np.ndarray:
     return converted
 
 
-def require_integers(name: str, array: np.ndarray, upper: int | None = None) -> np.ndarray:
+def require_integers(name: str, array: Shaped[np.ndarray, "*N"], upper: int | None = None) -> Int[np.ndarray, "*N"]:
     """Returns `array` as int64 with every entry in [0, upper); floats that are whole numbers are accepted."""
     if array.dtype.kind == "f":
         require_all(name, array, np.isfinite(array) & (array == np.floor(array)), "must be whole")
@@ -95,7 +104,9 @@ def require_integers(name: str, array: np.ndarray, upper: int | None = None) -> 
     return array.astype(np.int64)
 
 
-def require_distribution(name: str, array: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+def require_distribution(
+    name: str, array: Shaped[np.ndarray, "*M N"], rows: Bool[np.ndarray, "*M"] | None = None
+) -> Float[np.ndarray, "*M N"]:
     """Returns `array` as floats whose last axis sums to 1; what people have is brought there.
 
     Tables with six decimals (1/3, 1/6, 1/7) or once kept in float32 miss 1 in the last digits. Sums within
@@ -126,17 +137,17 @@ def require_distribution(name: str, array: np.ndarray, rows: np.ndarray | None =
     return array
 
 
-def sums_to_one(total: np.ndarray, dtype) -> np.ndarray:
+def sums_to_one(total: Float[np.ndarray, "*M"], dtype: DTypeLike) -> Bool[np.ndarray, "*M"]:
     """Whether totals of rows of the given type are 1, up to `row_tolerance`."""
     return np.abs(total - 1.0) <= row_tolerance(dtype)
 
 
-def row_tolerance(dtype) -> float:
+def row_tolerance(dtype: DTypeLike) -> float:
     """By how much a row of probabilities may miss the sum 1: 1e-5 in float64, 1e-4 in shorter types."""
     return 1e-5 if dtype == np.float64 else 1e-4
 
 
-def require_discount(discount, dtype=np.float64) -> np.ndarray:
+def require_discount(discount: Any, dtype: DTypeLike = np.float64) -> Float[np.ndarray, ""]:
     """Returns `discount` as a scalar of the given type, strictly between 0 and 1 there too."""
     discount = require_floats("discount", as_host_array("discount", discount))
     require_shape("discount", discount, "()", discount.ndim == 0)
@@ -148,7 +159,7 @@ def require_discount(discount, dtype=np.float64) -> np.ndarray:
     return rounded
 
 
-def require_count(name: str, value, least: int = 1) -> int:
+def require_count(name: str, value: Any, least: int = 1) -> int:
     """Returns `value` as an int of at least `least`."""
     try:
         value = operator.index(value)
@@ -159,7 +170,7 @@ def require_count(name: str, value, least: int = 1) -> int:
     return value
 
 
-def require_positive(name: str, value, *, or_zero: bool = False) -> None:
+def require_positive(name: str, value: Any, *, or_zero: bool = False) -> None:
     """Raises unless a number, or every number of an array, is positive where it is concrete."""
     if not is_traced(value):
         numbers = require_floats(name, as_host_array(name, value))
@@ -176,7 +187,7 @@ def require_slots(num_states: int, num_actions: int, width: int) -> None:
         )
 
 
-def require_model_pair(source, target) -> None:
+def require_model_pair(source: Num[np.ndarray, "n A n"] | Array, target: Num[np.ndarray, "m A m"] | Array) -> None:
     """Raises unless two transition tensors are [n, A, n] and [m, A, m] with one A."""
     for name, array in (("source", source), ("target", target)):
         good = array.ndim == 3 and array.shape[0] == array.shape[2]

@@ -26,7 +26,7 @@ _shortened.maxstring = _shortened.maxother = _LONGEST
 
 
 class Status(enum.IntEnum):
-    """How a lane ended. Bounds are valid whatever the status."""
+    """How a lane, one problem of a batch or the only one, ended. Bounds are valid whatever the status."""
 
     SOLVED = 0
     ITERATION_LIMIT = 1
@@ -73,9 +73,18 @@ class Record:
         """Returns the record with the given fields exchanged."""
         return dataclasses.replace(self, **changes)
 
+    def keys(self) -> list[str]:
+        """The names of the fields: `dict(record)` has them all."""
+        return [field.name for field in dataclasses.fields(self)]
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self.keys():
+            return getattr(self, name)
+        raise KeyError(name)
+
     def _figures(self) -> dict[str, Any]:
         """What `repr` shows, by name: the fields, unless a class knows better."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: getattr(self, name) for name in self.keys()}
 
     def __repr__(self) -> str:
         return summary(type(self).__name__, _figures_of(self))
@@ -84,7 +93,7 @@ class Record:
         return html_summary(type(self).__name__, _figures_of(self))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: getattr(self, name) for name in self.keys()}
 
 
 def summary(name: str, figures: Mapping[str, Any]) -> str:

@@ -119,4 +119,7 @@ def test_records_are_frozen_pytrees_without_what_is_dropped_or_remembered():
     copies = record.replace(gap=1), pickle.loads(pickle.dumps(record)), copy.copy(record), copy.deepcopy(record)
     for other in copies:
         assert (other.size, other.memory) == (2, "how") and not hasattr(other, "_remembered")
+    assert record["size"] == 2 and dict(record)["policy"] is record.policy
+    with pytest.raises(KeyError):
+        record["weights"]
     assert record == record and record != answer(size=2) and len({record, record}) == 1

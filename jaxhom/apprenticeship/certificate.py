@@ -15,13 +15,13 @@ import numpy as np
 
 from jaxhom.apprenticeship.exact import NEAR_ONE, Exact, exact_rows, rounded_down
 from jaxhom.apprenticeship.presolve import Reduction
-from jaxhom.apprenticeship.solution import NO_OCCUPANCY, Found, LPALSolution
+from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.mdp import MDP
-from jaxhom.planning.occupancy import occupancy
+from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, Float, Int
+    from jaxtyping import Float, Int
 
 _EPS = np.finfo(np.float64).eps
 
@@ -149,17 +149,3 @@ def simplex_point(weights: Float[np.ndarray, "*B K"]) -> Float[np.ndarray, "*B K
     largest = weights.max(axis=-1, keepdims=True)
     weights = np.where(largest > 0, weights / np.where(largest > 0, largest, 1.0), 1.0)
     return weights / weights.sum(axis=-1, keepdims=True)
-
-
-def policy_from_occupancy(
-    mdp: MDP, x: Float[Array, "*B S A"], fallback: Float[Array, "*B S A"], negligible: float = NO_OCCUPANCY
-) -> Float[Array, "*B S A"]:
-    """pi(s, a) = x(s, a) / sum_a' x(s, a') (eq. 5), [*B, S, A]; `fallback` where the state's share is negligible.
-
-    In NumPy if x is a NumPy array.
-    """
-    numpy = np if isinstance(x, np.ndarray) else jnp
-    x = numpy.maximum(x, 0.0)
-    total = x.sum(axis=-1, keepdims=True)
-    occurs = total > negligible / (1.0 - (float(mdp.discount) if numpy is np else mdp.discount))
-    return numpy.where(occurs, x / numpy.where(occurs, total, 1.0), fallback)

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.apprenticeship.certificate import policy_from_occupancy
 from jaxhom.apprenticeship.column_games import capacities, play
 from jaxhom.apprenticeship.column_lane import SLACK, Lane
 from jaxhom.apprenticeship.exact import NEAR_ONE, Exact
@@ -23,6 +22,7 @@ from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.responses import evaluate, evaluate_on_host, respond, respond_on_host, with_compact_features
 from jaxhom.apprenticeship.solution import Found
 from jaxhom.models.mdp import MDP, uniform_policy
+from jaxhom.planning.occupancy import policy_from_occupancy
 from jaxhom.solvers.game_interior_point import GameSolution
 from jaxhom.status import Status
 

@@ -18,14 +18,13 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom import checks
-from jaxhom.apprenticeship.certificate import policy_from_occupancy
 from jaxhom.apprenticeship.flow_factor import factor_flow
 from jaxhom.apprenticeship.flow_lp import FlowProblem
 from jaxhom.apprenticeship.planning_bound import UpperBound, better_bound, bound_by_planning
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.mdp import MDP, uniform_policy
-from jaxhom.planning.occupancy import occupancy
+from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
 from jaxhom.solvers import pdhg
 from jaxhom.status import Status
 

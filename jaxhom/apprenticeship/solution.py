@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxhom.planning.occupancy import NO_OCCUPANCY
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float, Int
-
-NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0, for x that solvers leave near 0
 
 
 class LPALSolution(Record):

@@ -26,7 +26,7 @@ from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, lo
 from jaxhom.interop.trajectories import demonstrations_from_csv
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
-from jaxhom.models.inputs import check_policy
+from jaxhom.models.inputs import check_coordinates, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
 from jaxhom.planning.optimal import Plan, optimal_policy
 
@@ -176,12 +176,6 @@ def _reward(mdp: MDP, reward: np.ndarray) -> jax.Array:
     return jnp.broadcast_to(checks.to_device(reward.reshape(states, -1)), (states, actions))
 
 
-def _coordinates(mdp: MDP, coordinates: np.ndarray) -> np.ndarray:
-    good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
-    checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
-    return checks.require_floats("coordinates", coordinates)
-
-
 def _terminal(mdp: MDP, terminal: np.ndarray) -> np.ndarray:
     checks.require_shape("terminal", terminal, f"({mdp.num_states},)", terminal.shape == (mdp.num_states,))
     if terminal.dtype != bool:
@@ -191,7 +185,7 @@ def _terminal(mdp: MDP, terminal: np.ndarray) -> np.ndarray:
     return terminal
 
 
-_CHECKS = {"reward": _reward, "coordinates": _coordinates, "terminal": _terminal}
+_CHECKS = {"reward": _reward, "coordinates": check_coordinates, "terminal": _terminal}
 
 
 def load_trajectories(problem: Problem, options) -> tuple[Demonstrations, str]:

@@ -9,9 +9,12 @@ The grid is cut into square, non-overlapping regions, with one indicator feature
 uniform on (0, 1) otherwise (`sample_weights`).
 """
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 import math
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +24,13 @@ from jaxhom import checks
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
+if TYPE_CHECKING:
+    from jax.typing import DTypeLike
+    from jaxtyping import Array, Float, Int, Key
+
 ACTIONS = ("up", "down", "left", "right")
 _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
-_REWARDED_FRACTION = 0.1  # probability that a region's weight is not zero
+_REWARDED_FRACTION = 0.1  # probability that a region's weight is not zero: the paper's
 
 
 class Gridworld(Record):
@@ -39,8 +46,8 @@ class Gridworld(Record):
     """
 
     mdp: MDP
-    coordinates: jax.Array
-    region: jax.Array
+    coordinates: Int[Array, "S 2"]
+    region: Int[Array, " S"]
     size: int = dataclasses.field(metadata={"static": True})
 
 
@@ -51,9 +58,9 @@ def gridworld(
     noise: float = 0.3,
     discount: float = 0.99,
     start: tuple[int, int] = (0, 0),
-    dtype=None,
+    dtype: DTypeLike | None = None,
 ) -> Gridworld:
-    """Builds the gridworld of section VI.A.
+    """Builds the gridworld of section VI.A. On the host: not under `jit`, `vmap` or `grad`.
 
     Args:
       size: number of rows and of columns, at least 1.
@@ -76,6 +83,8 @@ def gridworld(
       >>> world = gridworld(16, num_regions=64)
       >>> world.mdp.num_states, world.mdp.num_features
       (256, 64)
+
+    Source: Boularias and Chaib-draa 2010, section VI.A.
     """
     size = checks.require_count("size", size)
     if not 0.0 <= noise <= 1.0:
@@ -108,7 +117,7 @@ def gridworld(
 
 
 @functools.partial(jax.jit, static_argnames="num_regions")
-def sample_weights(key: jax.Array, num_regions: int) -> jax.Array:
+def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
     """Draws one weight per region: 0 with probability 0.9, otherwise uniform on (0, 1).
 
     A draw of nothing but zeros would make every policy optimal, so it is repeated until a weight is
@@ -124,6 +133,13 @@ def sample_weights(key: jax.Array, num_regions: int) -> jax.Array:
 
     Raises:
       ValueError: if `num_regions` is below 1.
+
+    Example:
+      >>> weights = sample_weights(jax.random.key(0), 64)
+      >>> weights.shape, bool((weights > 0).any()), bool((weights < 1).all())
+      ((64,), True, True)
+
+    Source: Boularias and Chaib-draa 2010, section VI.A.
     """
     if num_regions < 1:
         raise ValueError(f"num_regions must be at least 1, got {num_regions}")

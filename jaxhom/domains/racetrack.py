@@ -29,11 +29,13 @@ Algorithm 1 matches after 2 demonstrations (77%; 22% if the match must hold in b
 States are numbered cell by cell: state = 25 * cell + speed.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import os
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -42,6 +44,10 @@ from jaxhom.domains.track_maps import read_map
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
+if TYPE_CHECKING:
+    from jax.typing import DTypeLike
+    from jaxtyping import Array, Bool, Float, Int
+
 ACTIONS = ("nothing", "up", "down", "left", "right")
 SHIPPED_STARTS = {"a": ((7, 0),), "b": None}
 """Default `start` of the shipped tracks: one place of the start line on (a), anywhere on (b)."""
@@ -49,8 +55,8 @@ SHIPPED_STARTS = {"a": ((7, 0),), "b": None}
 _ACCELERATIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
 _SPEEDS = np.stack(np.divmod(np.arange(25), 5), axis=-1) - 2
 _STANDING = 12  # index of speed (0, 0)
-_SUCCESS = (0.9, 0.5)  # of a change of speed: low or zero speed, high speed
-_WEIGHTS = (5.0, 200.0)
+_SUCCESS = (0.9, 0.5)  # of a change of speed at low or zero and at high speed: the paper's
+_WEIGHTS = (5.0, 200.0)  # the paper's rewards of a step on the road and of the finish
 _ON_ROAD, _FINISH, _OFF_ROAD = range(3)
 
 
@@ -74,12 +80,12 @@ class Racetrack(Record):
     """
 
     mdp: MDP
-    weights: jax.Array
-    cells: jax.Array
-    speeds: jax.Array
-    coordinates: jax.Array
-    terminal: jax.Array
-    off_road: jax.Array
+    weights: Float[Array, " 2"]
+    cells: Int[Array, "C 2"]
+    speeds: Int[Array, "25 2"]
+    coordinates: Int[Array, "S 2"]
+    terminal: Bool[Array, " S"]
+    off_road: Float[Array, "S A"]
     rows: tuple[str, ...] = dataclasses.field(metadata={"static": True})
 
     def state_of(self, cell: Sequence[int], speed: Sequence[int] = (0, 0)) -> int:
@@ -100,9 +106,9 @@ def racetrack(
     *,
     discount: float = 0.99,
     start: Iterable[Sequence[int]] | None = None,
-    dtype=None,
+    dtype: DTypeLike | None = None,
 ) -> Racetrack:
-    """Builds the racetrack of section VI.B.
+    """Builds the racetrack of section VI.B. On the host: not under `jit`, `vmap` or `grad`.
 
     A map has one letter per cell: `X`, `#` or `o` wall, space, `.` or `P` road, `S` road on the
     start line, `F` or `G` finish line, in either case, and `@` where the map ends; beyond it is
@@ -133,6 +139,8 @@ def racetrack(
       >>> track = racetrack(["XXXX", "S..F", "XXXX"])
       >>> track.mdp.num_states, track.state_of((1, 0))
       (100, 12)
+
+    Source: Boularias and Chaib-draa 2010, section VI.B.
     """
     if start is None and isinstance(track, str):
         start = SHIPPED_STARTS.get(track)

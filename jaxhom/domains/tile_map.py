@@ -4,14 +4,20 @@ Gridworlds and racetracks are domains of this library and know their geometry. A
 an environment's table say, has none; `TileMap` lays its states out on a map.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Int
 
 
 class TileMap(Record):
@@ -29,12 +35,17 @@ class TileMap(Record):
     moves: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
 
     @classmethod
-    def from_rows(cls, mdp: MDP, rows: Sequence[str], moves: Sequence[Sequence[int]]) -> "TileMap":
+    def from_rows(cls, mdp: MDP, rows: Sequence[str], moves: Sequence[Sequence[int]]) -> TileMap:
         """Lays a model out.
 
         Raises:
           ValueError: if the map is not a rectangle of as many cells as the model has states, a letter is unknown, or
             there is not one move per action.
+
+        Example:
+          >>> corridor = MDP.from_successors([[[1]], [[1]]], [[[1.0]], [[1.0]]], discount=0.9)
+          >>> TileMap.from_rows(corridor, ["SF"], [(0, 1)]).state_of((0, 1))
+          1
         """
         rows = tuple(rows)
         is_rectangle = len({len(row) for row in rows}) == 1
@@ -49,8 +60,8 @@ class TileMap(Record):
         return cls(mdp=mdp, rows=rows, moves=tuple((int(row), int(column)) for row, column in directions))
 
     @property
-    def coordinates(self) -> np.ndarray:
-        """int [S, 2], (row, column) of every state."""
+    def coordinates(self) -> Int[np.ndarray, "S 2"]:
+        """(row, column) of every state."""
         return np.stack(np.divmod(np.arange(self.mdp.num_states), len(self.rows[0])), axis=-1)
 
     def state_of(self, cell: Sequence[int]) -> int:

@@ -30,7 +30,7 @@ from jaxhom.generalization.explainers import (
 from jaxhom.generalization.explanation import Explanation
 from jaxhom.generalization.votes import Votes, vote_of_nearest, vote_of_rings
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, check_coordinates
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.homomorphism import ClassSimilarity
 from jaxhom.similarity.local_models import LocalModelClasses, local_model_classes
@@ -231,10 +231,7 @@ def nearest_neighbors(
         raise ValueError(f'metric must be "hops" or "euclidean", got {metric!r}')
     if coordinates is None:
         raise ValueError('metric="euclidean" needs coordinates [S, D]')
-    coordinates = checks.as_host_array("coordinates", coordinates)
-    good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
-    checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
-    coordinates = checks.require_floats("coordinates", coordinates)
+    coordinates = check_coordinates(mdp, coordinates)
     start = maximum_entropy(mdp, demonstrations)
     accept = _voters(mdp, start) if mdp.restricts_actions else None
     votes = vote_of_nearest(evidence.deciding(mdp, start.visited), np.asarray(start.policy), coordinates, accept)

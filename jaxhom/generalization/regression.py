@@ -24,15 +24,15 @@ from jaxhom.generalization import evidence
 from jaxhom.generalization.explainers import ByOccupancy
 from jaxhom.generalization.generalization import Generalization
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
-from jaxhom.models.inputs import as_model
-from jaxhom.models.mdp import MDP
+from jaxhom.models.inputs import as_model, check_coordinates
+from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning.flow_matrix import flow_matrix
+from jaxhom.planning.occupancy import has_occupancy, policy_from_occupancy
 from jaxhom.solvers.normal_equations import Rows
 from jaxhom.solvers.sparse_interior_point import solve
 
 _TOLERANCE = 1e-7  # of the objective and of the residuals, as a share of all discounted time
 _GOOD_ENOUGH = 1e-5  # beyond which HiGHS has to do it
-_NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0
 
 
 def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) -> Generalization:
@@ -54,15 +54,11 @@ def occupancy_regression(mdp: MDP, demonstrations: Demonstrations, coordinates) 
     Source: Boularias and Chaib-draa 2010, section VI; the linear program is written out above.
     """
     mdp = as_model(mdp)
-    coordinates = checks.as_host_array("coordinates", coordinates)
-    good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
-    checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
-    basis = quadratic_basis(checks.require_floats("coordinates", coordinates))
+    basis = quadratic_basis(check_coordinates(mdp, coordinates))
     visited, empirical = (np.asarray(array) for array in empirical_policy(mdp, demonstrations))
     decides = evidence.deciding(mdp, visited)
     x = _solve(mdp, basis, _expansion(mdp, decides, empirical)).reshape(empirical.shape)
-    occurs = x.sum(axis=1) > _NO_OCCUPANCY / (1.0 - float(mdp.discount))
-    policy, _ = evidence.policy_of_votes(mdp, np.where(occurs[:, None], x, 0.0))
+    occurs, policy = has_occupancy(mdp, x), policy_from_occupancy(mdp, x, np.asarray(uniform_policy(mdp)))
     found = np.where(occurs, 1, -1)
     return Generalization(
         policy=checks.to_device(np.where(visited[:, None], empirical, policy), mdp.dtype),

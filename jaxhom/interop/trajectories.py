@@ -20,8 +20,9 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.interop.files import FileError
-from jaxhom.models.demonstrations import Demonstrations, require_no_steps
+from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
+from jaxhom.models.trajectories import require_no_steps
 
 COLUMNS = ("episode", "state", "action")
 STEP_COLUMNS = ("step", "t", "time", "timestep")

@@ -5,9 +5,11 @@ also carry how they ended: an episode that *terminated* is absorbed for good, on
 have gone on.
 """
 
-import functools
+from __future__ import annotations
+
 import operator
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,12 @@ from jaxhom import checks
 from jaxhom.models import episode_ends, impossible_steps
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, uniform_policy
+from jaxhom.models.sampling import sample_walks
+from jaxhom.models.trajectories import padded, require_flags
 from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
 
 class Demonstrations(Record):
@@ -38,13 +45,13 @@ class Demonstrations(Record):
         for all if not given.
     """
 
-    states: jax.Array
-    actions: jax.Array
-    mask: jax.Array
-    terminated: jax.Array | None = None
-    final_states: jax.Array | None = None
+    states: Int[Array, "M H"]
+    actions: Int[Array, "M H"]
+    mask: Bool[Array, "M H"]
+    terminated: Bool[Array, " M"] | None = None
+    final_states: Int[Array, " M"] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # Trees of axes or types are built through here too: what stands for the mask stands for these fields as well.
         is_array = hasattr(self.mask, "shape") and len(self.mask.shape) > 0
         defaults = {"terminated": (False, bool), "final_states": (-1, jnp.int32)}
@@ -54,8 +61,12 @@ class Demonstrations(Record):
                 object.__setattr__(self, name, filled)
 
     @classmethod
-    def from_trajectories(cls, trajectories, terminated=None) -> "Demonstrations":
+    def from_trajectories(
+        cls, trajectories: Iterable[Any], terminated: Bool[ArrayLike, " M"] | None = None
+    ) -> Demonstrations:
         """Builds demonstrations from a sequence of (states, actions) pairs of integer sequences.
+
+        On the host: not under `jit`, `vmap` or `grad`; what comes out passes through all three.
 
         Args:
           trajectories: M pairs of non-empty sequences with as many states as actions, or one more: the last is then the
@@ -66,35 +77,13 @@ class Demonstrations(Record):
           ValueError: if there is no trajectory, one is empty or not a pair, its lengths do not fit, an entry is
             negative or not whole (the trajectory and the step are named), `terminated` is not bool [M], or all
             of them padded to the longest are too many steps for 32-bit indices.
+
+        Example:
+          >>> demonstrations = Demonstrations.from_trajectories([([0, 1, 2], [1, 1]), ([0, 3], [0])])
+          >>> demonstrations.states.tolist(), demonstrations.final_states.tolist()
+          ([[0, 1], [0, 0]], [2, 3])
         """
-        try:
-            trajectories = list(trajectories)
-        except TypeError:
-            kind = type(trajectories).__name__
-            raise ValueError(f"trajectories must be a sequence of pairs (states, actions), got {kind}") from None
-        if not trajectories:
-            raise ValueError("at least one trajectory is needed, got none")
-        rows = [_validated_trajectory(i, pair) for i, pair in enumerate(trajectories)]
-        require_no_steps(list(enumerate(trajectories)), "trajectory")
-        if terminated is None:
-            terminated = np.zeros(len(rows), bool)
-        terminated = _require_flags("terminated", checks.as_host_array("terminated", terminated), len(rows))
-        horizon = max(len(actions) for _, actions in rows)
-        if len(rows) * horizon > checks.MAX_SLOTS:
-            raise ValueError(
-                f"{len(rows)} trajectories padded to the longest, {horizon} steps, are more than 2^31 - 2 steps: "
-                "cut the long ones into pieces"
-            )
-        states, actions = np.zeros((2, len(rows), horizon), np.int32)
-        mask, final_states = np.zeros((len(rows), horizon), bool), np.full(len(rows), -1, np.int32)
-        for i, (row_states, row_actions) in enumerate(rows):
-            length = len(row_actions)
-            states[i, :length] = row_states[:length]
-            actions[i, :length] = row_actions
-            mask[i, :length] = True
-            final_states[i] = row_states[length] if len(row_states) > length else -1
-        arrays = {"states": states, "actions": actions, "mask": mask}
-        arrays |= {"terminated": terminated, "final_states": final_states}
+        arrays = padded(trajectories, terminated)
         return cls(**{name: checks.to_device(array) for name, array in arrays.items()})
 
     @property
@@ -110,7 +99,7 @@ class Demonstrations(Record):
     def __len__(self) -> int:
         return self.num_trajectories
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: Any) -> Any:
         try:
             index = operator.index(index)
         except TypeError:
@@ -173,8 +162,10 @@ class Demonstrations(Record):
             checks.require_all("actions", actions, exists | ~mask, message)
 
 
-def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Array, jax.Array]:
+def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[Bool[Array, " S"], Float[Array, "S A"]]:
     """Frequencies of the expert's actions in the states that were demonstrated.
+
+    Works under `jit` and `vmap`; counts have no derivative.
 
     Absorbing states are no exception: if steps were recorded in one, it counts as visited, and its row says what was
     done there. That is no decision, though, and the methods that carry the expert's policy over to other states leave
@@ -196,6 +187,12 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Arra
     Warns:
       ImpossibleStepsWarning: if steps have probability 0; see `Demonstrations.validate`.
 
+    Example:
+      >>> ring = MDP.from_successors([[[1], [0]], [[0], [1]]], [[[1.0]] * 2] * 2, discount=0.9)
+      >>> visited, policy = empirical_policy(ring, Demonstrations.from_trajectories([([0, 0, 0], [1, 1, 0])]))
+      >>> visited.tolist(), policy.round(2).tolist()
+      ([True, False], [[0.33, 0.67], [0.5, 0.5]])
+
     Source: Boularias and Chaib-draa 2010, section V.
     """
     mdp = as_model(mdp)
@@ -210,8 +207,10 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Arra
     return visited, jnp.where(visited[:, None], frequencies, uniform_policy(mdp))
 
 
-def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> jax.Array:
+def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> Float[Array, " K"]:
     """Feature expectations as the demonstrations' mean, 1/M sum_m sum_t gamma^t phi(s_t, a_t), t from 0.
+
+    Works under `jit`, `vmap` and `grad`, in features and discount.
 
     Where an episode terminated, the sum goes on to infinity: gamma^T phi(z) / (1 - gamma) is added, T the number of its
     steps, z the absorbing state that it ended in, phi(z) the mean over the actions allowed there. Where the final state
@@ -233,6 +232,11 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
     Warns:
       ImpossibleStepsWarning: if steps have probability 0; see `Demonstrations.validate`.
 
+    Example:
+      >>> ring = MDP.from_successors([[[1]], [[0]]], [[[1.0]]] * 2, discount=0.5, features=[[1.0], [4.0]])
+      >>> monte_carlo_feature_expectations(ring, Demonstrations.from_trajectories([([0, 1, 0], [0, 0, 0])])).tolist()
+      [3.25]
+
     Source: Boularias and Chaib-draa 2010, eq. (6), with the first step counted as gamma^0.
     """
     mdp = as_model(mdp)
@@ -244,7 +248,7 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
 
 
 @jax.jit
-def _expectations(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Array, jax.Array]:
+def _expectations(mdp: MDP, demonstrations: Demonstrations) -> tuple[Float[Array, " K"], Bool[Array, " M"]]:
     steps = jnp.arange(demonstrations.horizon)
     weight = jnp.where(demonstrations.mask, mdp.discount**steps, 0.0)
     # Weights are summed per pair first: [M, H, K] would not fit for long demonstrations and many features.
@@ -254,16 +258,22 @@ def _expectations(mdp: MDP, demonstrations: Demonstrations) -> tuple[jax.Array, 
 
 
 def sample_demonstrations(
-    key: jax.Array, mdp: MDP, policy: jax.Array, num_trajectories: int, horizon: int, *, terminal=None
+    key: Key[Array, ""],
+    mdp: MDP,
+    policy: Float[ArrayLike, "S A"] | Int[ArrayLike, " S"],
+    num_trajectories: int,
+    horizon: int,
+    *,
+    terminal: Bool[ArrayLike, " S"] | None = None,
 ) -> Demonstrations:
     """Draws trajectories of a policy, started from the model's initial distribution.
 
-    Works under `jit` and `vmap`, with the counts static.
+    Works under `jit` and `vmap`, with the counts static; draws have no derivative.
 
     Args:
       key: a `jax.random` key; the same key gives the same trajectories, with `terminal` up to their ends.
       mdp: the model.
-      policy: [S, A], rows sum to 1.
+      policy: [S, A], rows sum to 1; integers [S] are the actions of one that is deterministic.
       num_trajectories: M, at least 1.
       horizon: H, the largest number of steps of a trajectory, at least 1.
       terminal: bool [S], states in which an episode ends: it has no step there. None if episodes are not to end; a walk
@@ -276,102 +286,21 @@ def sample_demonstrations(
     Raises:
       ValueError: if `policy` has another shape or is none, a count is below 1, or `terminal` is not bool [S] or True
         where episodes start.
+
+    Example:
+      >>> ring = MDP.from_successors([[[1]], [[2]], [[2]]], [[[1.0]]] * 3, discount=0.9, initial=[1, 0, 0])
+      >>> walks = sample_demonstrations(jax.random.key(0), ring, [0, 0, 0], 1, 4, terminal=[False, False, True])
+      >>> walks.states.tolist(), walks.mask.tolist(), walks.terminated.tolist()
+      ([[0, 1, 0, 0]], [[True, True, False, False]], [True])
     """
     mdp = as_model(mdp)
     policy = check_policy(mdp, policy, batch=False)
     num_trajectories = checks.require_count("num_trajectories", num_trajectories)
     horizon = checks.require_count("horizon", horizon)
     if terminal is not None:
-        terminal = _require_flags("terminal", jnp.asarray(terminal), mdp.num_states)
+        terminal = require_flags("terminal", jnp.asarray(terminal), mdp.num_states)
         if not checks.is_traced(terminal, mdp.initial):
             starts = np.asarray(mdp.initial) > 0
             message = "must be False where episodes start: one that starts there has no step"
             checks.require_all("terminal", np.asarray(terminal), ~(starts & np.asarray(terminal)), message)
-    return _sample(key, mdp, policy, terminal, num_trajectories, horizon)
-
-
-@functools.partial(jax.jit, static_argnums=(4, 5))
-def _sample(key, mdp, policy, terminal, num_trajectories, horizon) -> Demonstrations:
-    initial_key, steps_key = jax.random.split(key)
-    lanes = (num_trajectories,)
-    uniform = jax.random.uniform(initial_key, lanes, mdp.dtype)
-    first = jax.vmap(_inverse_cdf, in_axes=(None, 0))(jnp.cumsum(mdp.initial), uniform)
-    draw = jax.vmap(_inverse_cdf)
-    ends = jnp.zeros(mdp.num_states, bool) if terminal is None else terminal
-
-    def step(state, key):
-        draw_action, draw_successor = jax.random.uniform(key, (2, *lanes), mdp.dtype)
-        action = draw(jnp.cumsum(policy[state], axis=-1), draw_action)
-        slot = draw(jnp.cumsum(mdp.probability[state, action], axis=-1), draw_successor)
-        goes_on = ~ends[state]  # an episode that has ended stays where it is
-        return jnp.where(goes_on, mdp.next_state[state, action, slot], state), (state, action, goes_on)
-
-    last, (states, actions, mask) = jax.lax.scan(step, first, jax.random.split(steps_key, horizon))
-    steps = {"states": jnp.where(mask, states, 0).T, "actions": jnp.where(mask, actions, 0).T, "mask": mask.T}
-    if terminal is None:
-        return Demonstrations(**steps)
-    return Demonstrations(**steps, terminated=ends[last], final_states=last)
-
-
-def _inverse_cdf(cumulative: jax.Array, uniform: jax.Array) -> jax.Array:
-    """First index whose cumulative weight, [N], exceeds `uniform` in [0, 1) times the total.
-
-    Scaled by the total and strictly below it: an index of probability zero is never drawn, whatever the rounding.
-    """
-    total = cumulative[-1]
-    target = jnp.minimum(uniform * total, jnp.nextafter(total, jnp.zeros_like(total)))
-    return jnp.searchsorted(cumulative, target, side="right").astype(jnp.int32)
-
-
-def require_no_steps(pairs, kind: str) -> None:
-    """Raises if nothing tells pairs (states, actions) from episodes of two steps (state, action) each.
-
-    That is so where all pairs hold two and two numbers, and are not in the form that is asked for, a tuple of two lists
-    or arrays. A single longer one shows what is meant.
-
-    Args:
-      pairs: what was given, with its position, [(position, pair), ...].
-      kind: what a pair is called in the message.
-    """
-    if pairs and all(_may_be_steps(pair) for _, pair in pairs):
-        position, pair = pairs[0]
-        raise ValueError(
-            f"{kind} {position} could be (states, actions) or two steps (state, action), got "
-            f"{checks.in_one_line(pair)}: pass a tuple of two lists or arrays, ([state, state], [action, action])"
-        )
-
-
-def _may_be_steps(pair) -> bool:
-    parts = [part for part in pair if isinstance(part, tuple | list) or (isinstance(part, np.ndarray) and part.ndim)]
-    parts = [part for part in parts if len(part) == 2]
-    if len(parts) < 2 or any(hasattr(entry, "__len__") for part in parts for entry in part):
-        return False
-    return not isinstance(pair, tuple) or all(isinstance(part, tuple) for part in parts)
-
-
-def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:
-    """Checks one (states, actions) pair."""
-    try:
-        states, actions = pair
-    except (TypeError, ValueError):
-        raise ValueError(f"trajectory {index} must be a pair (states, actions)") from None
-    states = checks.as_host_array(f"trajectory {index} states", states)
-    actions = checks.as_host_array(f"trajectory {index} actions", actions)
-    for name, array in (("states", states), ("actions", actions)):
-        checks.require_shape(f"trajectory {index} {name}", array, "[H]", array.ndim == 1)
-    if len(states) - len(actions) not in (0, 1):
-        counts = f"{len(states)} states and {len(actions)} actions"
-        raise ValueError(f"trajectory {index} has {counts}: as many are needed, or one state more, where it ended")
-    if not len(actions):
-        raise ValueError(f"trajectory {index} is empty")
-    upper = 2**31 - 1
-    states = checks.require_integers(f"trajectory {index} states", states, upper)
-    return states, checks.require_integers(f"trajectory {index} actions", actions, upper)
-
-
-def _require_flags(name: str, array, count: int):
-    """Returns `array` if it is bool [count], or raises."""
-    checks.require_shape(name, array, f"({count},)", array.shape == (count,))
-    if array.dtype != bool:
-        raise ValueError(f"{name} must be bool, got dtype {array.dtype}")
-    return array
+    return Demonstrations(**sample_walks(key, mdp, policy, terminal, num_trajectories, horizon))

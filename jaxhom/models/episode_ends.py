@@ -12,14 +12,20 @@ an absorbing state in which the features are the same for every action. A bandit
 expert does there is a decision.
 """
 
-import jax
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhom.models.mdp import MDP, absorbing_states, push_forward, uniform_policy
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Bool, Float, Int
 
-def absorbed_time(mdp: MDP, demonstrations) -> tuple[jax.Array, jax.Array]:
+
+def absorbed_time(mdp: MDP, demonstrations: Any) -> tuple[Float[Array, "S A"], Bool[Array, " M"]]:
     """Discounted time that the episodes spend absorbed after their ends.
 
     Args:
@@ -44,7 +50,7 @@ def absorbed_time(mdp: MDP, demonstrations) -> tuple[jax.Array, jax.Array]:
     return stays[:, None] * uniform_policy(mdp), demonstrations.terminated & ~from_pair & ~in_final
 
 
-def refuse_lost(demonstrations, is_lost: np.ndarray) -> None:
+def refuse_lost(demonstrations: Any, is_lost: Bool[np.ndarray, " M"]) -> None:
     """Raises `ValueError` naming the first of the episodes that terminated where nothing absorbs."""
     if not is_lost.any():
         return
@@ -60,7 +66,7 @@ def refuse_lost(demonstrations, is_lost: np.ndarray) -> None:
     raise ValueError(f"trajectory {lost} terminated {where}: if it was cut off there, its `terminated` must be False")
 
 
-def _last_steps(demonstrations) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _last_steps(demonstrations: Any) -> tuple[Int[Array, " M"], Int[Array, " M"], Int[Array, " M"]]:
     """Steps [M] up to the last that the mask shows, and that one's state and action; 0, 0, 0 where there is none."""
     mask = demonstrations.mask
     length = jnp.where(mask.any(axis=1), mask.shape[1] - mask[:, ::-1].argmax(axis=1), 0)
@@ -69,13 +75,13 @@ def _last_steps(demonstrations) -> tuple[jax.Array, jax.Array, jax.Array]:
     return length, *columns
 
 
-def _ignores_actions(mdp: MDP) -> jax.Array:
-    """bool [S]: the features are the same for all actions that are allowed there."""
+def _ignores_actions(mdp: MDP) -> Bool[Array, " S"]:
+    """The features are the same for all actions that are allowed there."""
     exists = mdp.allowed[..., None]
     highest = jnp.where(exists, mdp.features, -jnp.inf).max(axis=1)
     return (highest == jnp.where(exists, mdp.features, jnp.inf).min(axis=1)).all(axis=-1)
 
 
-def _probability_into(mdp: MDP, states: jax.Array) -> jax.Array:
-    """[S, A]: the probability that a step leads into one of the given states, bool [S]."""
+def _probability_into(mdp: MDP, states: Bool[Array, " S"]) -> Float[Array, "S A"]:
+    """The probability that a step leads into one of the given states."""
     return jnp.where(states[mdp.next_state], mdp.probability, 0.0).sum(axis=-1)

@@ -4,12 +4,17 @@ Demonstrations of another map, or whose states are numbered from 1, mostly lie w
 a bad policy without a sign. What gives them away is the dynamics: T(s_t, a_t, s_{t+1}) = 0.
 """
 
+from __future__ import annotations
+
 import warnings
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jaxhom.models.mdp import MDP
+
+if TYPE_CHECKING:
+    from jaxtyping import Int
 
 OPTIONS = ("refuse", "warn", "ignore")
 
@@ -19,21 +24,21 @@ class ImpossibleStepsWarning(UserWarning):
 
 
 class Steps(NamedTuple):
-    """P steps whose successor is known, each [P]: where they are and s, a, s'."""
+    """P steps whose successor is known: where they are and s, a, s'."""
 
-    trajectory: np.ndarray
-    time: np.ndarray
-    state: np.ndarray
-    action: np.ndarray
-    successor: np.ndarray
+    trajectory: Int[np.ndarray, " P"]
+    time: Int[np.ndarray, " P"]
+    state: Int[np.ndarray, " P"]
+    action: Int[np.ndarray, " P"]
+    successor: Int[np.ndarray, " P"]
 
 
-def report_impossible(mdp: MDP, demonstrations, impossible: str) -> None:
+def report_impossible(mdp: MDP, demonstrations: Any, impossible: str) -> None:
     """Raises `ValueError` ("refuse") or warns ("warn") if steps have probability 0, saying how many and the first."""
     if impossible == "ignore":
         return
     steps = known_steps(demonstrations)
-    bad = ~_is_possible(mdp, steps)
+    bad = ~mdp.dynamics.leads(steps.state, steps.action, steps.successor)
     if not bad.any():
         return
     trajectory, time, state, action, successor = (int(column[bad.argmax()]) for column in steps)
@@ -47,7 +52,7 @@ def report_impossible(mdp: MDP, demonstrations, impossible: str) -> None:
     warnings.warn(message, ImpossibleStepsWarning, stacklevel=4)
 
 
-def known_steps(demonstrations) -> Steps:
+def known_steps(demonstrations: Any) -> Steps:
     """The steps that are followed by one that the mask shows too, or by a final state that is known."""
     horizon = demonstrations.horizon
     fields = demonstrations.states, demonstrations.actions, demonstrations.mask
@@ -60,18 +65,3 @@ def known_steps(demonstrations) -> Steps:
     trajectory, time = np.nonzero(mask & (follows >= 0))
     at = trajectory, time
     return Steps(trajectory, time, states[at], actions[at], follows[at])
-
-
-def _is_possible(mdp: MDP, steps: Steps) -> np.ndarray:
-    """bool [P]: T(s, a, s') > 0; looked up among the successors of the pairs that occur, each once."""
-    probability = np.asarray(mdp.probability)
-    if mdp.is_dense:
-        return probability[steps.state, steps.action, steps.successor] > 0
-    pairs, row = np.unique(steps.state.astype(np.int64) * mdp.num_actions + steps.action, return_inverse=True)
-    width = probability.shape[-1]
-    listed = probability.reshape(-1, width)[pairs] > 0
-    successors = np.asarray(mdp.next_state).reshape(-1, width)[pairs].astype(np.int64)
-    edges = (np.arange(len(pairs))[:, None] * mdp.num_states + successors)[listed]  # ascending, as successors are
-    wanted = row * mdp.num_states + steps.successor
-    place = np.minimum(np.searchsorted(edges, wanted), len(edges) - 1)
-    return edges[place] == wanted

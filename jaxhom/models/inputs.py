@@ -3,6 +3,10 @@
 Values are checked where they are concrete; under jit, vmap and grad only shapes are.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +14,11 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Float, Num
 
-def as_model(mdp) -> MDP:
+
+def as_model(mdp: Any) -> MDP:
     """The model itself, or that of an environment or domain (whatever has it as `.mdp`); the doors' first line."""
     model = getattr(mdp, "mdp", mdp)
     if not isinstance(model, MDP):
@@ -19,7 +26,7 @@ def as_model(mdp) -> MDP:
     return model
 
 
-def check_policy(mdp: MDP, policy, name: str = "policy", *, batch: bool = True) -> jax.Array:
+def check_policy(mdp: MDP, policy: Any, name: str = "policy", *, batch: bool = True) -> Float[Array, "*B S A"]:
     """The policy as probabilities in the model's type, whatever form it was given in; every door's one check.
 
     Args:
@@ -48,7 +55,7 @@ def check_policy(mdp: MDP, policy, name: str = "policy", *, batch: bool = True) 
     return checks.to_device(host, mdp.dtype)
 
 
-def require_policy_shape(mdp: MDP, policy, name: str = "policy", *, batch: bool = True):
+def require_policy_shape(mdp: MDP, policy: Any, name: str = "policy", *, batch: bool = True) -> Array | np.ndarray:
     """The policy as an array of one of the forms of `check_policy`, its values not looked at; or `ValueError`."""
     policy = getattr(policy, "policy", policy)
     if not isinstance(policy, jax.core.Tracer):
@@ -61,7 +68,19 @@ def require_policy_shape(mdp: MDP, policy, name: str = "policy", *, batch: bool 
     return policy
 
 
-def check_reward(mdp: MDP, reward, policy_shape: tuple[int, ...]) -> jax.Array:
+def check_coordinates(mdp: MDP, coordinates: Float[ArrayLike, "S D"]) -> Float[np.ndarray, "S D"]:
+    """Positions of the states, in any number D of dimensions, on the host.
+
+    Raises:
+      ValueError: if they are not [S, D], or one is not finite.
+    """
+    coordinates = checks.as_host_array("coordinates", coordinates)
+    good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
+    checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
+    return checks.require_floats("coordinates", coordinates)
+
+
+def check_reward(mdp: MDP, reward: Num[ArrayLike, "*B S A"], policy_shape: tuple[int, ...]) -> Float[Array, "*B S A"]:
     """A reward that goes with a policy, in the model's type; 0 where an action is not allowed.
 
     Args:
@@ -80,7 +99,9 @@ def check_reward(mdp: MDP, reward, policy_shape: tuple[int, ...]) -> jax.Array:
     return check_reward_values(mdp, reward)
 
 
-def check_reward_values(mdp: MDP, reward, *, forbidden: float = 0.0, may_forbid: bool = False) -> jax.Array:
+def check_reward_values(
+    mdp: MDP, reward: Num[ArrayLike, "..."], *, forbidden: float = 0.0, may_forbid: bool = False
+) -> Float[Array, "..."]:
     """Rewards [..., S, A] or [..., S] in the model's type; `forbidden` stands where an action is not allowed.
 
     Raises:

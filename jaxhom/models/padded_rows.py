@@ -4,13 +4,21 @@ Sparse products run on padded rows: entry [r, n] names the n-th number that row 
 than most (a restart anywhere on a track, say) would make every row pay for them, so they are kept apart.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhom.status import Record
 
-_MAX_UNROLL = 16
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Float, Int, Num
+
+_MAX_UNROLL = 16  # terms that are written out; longer sums are loops over blocks of so many
+MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one: programs would take minutes to compile
 
 
 class PaddedRows(Record):
@@ -22,17 +30,17 @@ class PaddedRows(Record):
       wide: [J, V, ...], those items; the sentinel where a row is shorter.
     """
 
-    narrow: jax.Array
-    wide_row: jax.Array
-    wide: jax.Array
+    narrow: Num[Array, "R W *X"]
+    wide_row: Int[Array, " J"]
+    wide: Num[Array, "J V *X"]
 
-    def lookup(self, table: jax.Array) -> "PaddedRows":
+    def lookup(self, table: Num[Array, "I *X"]) -> PaddedRows:
         """The rows with every item i replaced by table[i]."""
         return PaddedRows(narrow=table[self.narrow], wide_row=self.wide_row, wide=table[self.wide])
 
 
-def pad_rows(items: np.ndarray, owner: np.ndarray, num_rows: int, sentinel: int) -> PaddedRows:
-    """Lists, per row, the items that it owns, in their order: items and owner [n], owner in [0, num_rows)."""
+def pad_rows(items: Int[np.ndarray, " I"], owner: Int[np.ndarray, " I"], num_rows: int, sentinel: int) -> PaddedRows:
+    """Lists, per row, the items that it owns, in their order; owners in [0, num_rows). On the host."""
     order = np.argsort(owner, kind="stable")
     items, owner = items[order], owner[order]
     counts = np.bincount(owner, minlength=num_rows)
@@ -50,7 +58,7 @@ def pad_rows(items: np.ndarray, owner: np.ndarray, num_rows: int, sentinel: int)
     return PaddedRows(narrow=narrow, wide_row=wide_row.astype(np.int32), wide=wide)
 
 
-def narrow_width(counts: np.ndarray) -> int:
+def narrow_width(counts: Int[np.ndarray, " R"]) -> int:
     """Width that minimises the items read per sweep, all rows to the width and long rows to the end."""
     longest = int(counts.max())
     widths = np.unique(counts[counts > 0])
@@ -60,7 +68,7 @@ def narrow_width(counts: np.ndarray) -> int:
     return int(widths[best]) if 2 * cost[best] < cost[-1] else longest
 
 
-def sum_rows(index: PaddedRows, weight: PaddedRows, values: jax.Array) -> jax.Array:
+def sum_rows(index: PaddedRows, weight: PaddedRows, values: Float[Array, "S *B"]) -> Float[Array, "R *B"]:
     """sum_n weight[r, n] values[index[r, n]] for every row; `values` [S] or [S, B], weights without B or with it."""
     total = gather_sum(index.narrow, weight.narrow, values)
     if index.wide_row.size:
@@ -68,7 +76,7 @@ def sum_rows(index: PaddedRows, weight: PaddedRows, values: jax.Array) -> jax.Ar
     return total
 
 
-def gather_sum(index: jax.Array, weight: jax.Array, values: jax.Array) -> jax.Array:
+def gather_sum(index: Int[Array, "*R n"], weight: Float[Array, "*R n *B"], values: Float[ArrayLike, "S *B"]) -> Array:
     """sum_n weight[..., n] values[index[..., n]], unrolled while n is small.
 
     Args:

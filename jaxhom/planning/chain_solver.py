@@ -1,7 +1,7 @@
 """Linear systems of a policy's chain, in JAX: for programs, for batches, and for models whose graph fills up.
 
 With P_pi(s, s') = sum_a pi(s, a) T(s, a, s') these are x = b + gamma P_pi x (values) and its transpose (flows). Small
-models are solved by dense LU. Larger ones by BiCGSTAB on the products with P_pi (see `policy_chain`), followed, where
+models are solved by dense LU. Larger ones by BiCGSTAB on the products with P_pi (`Dynamics.chain`), followed, where
 Krylov stops short, by some plain sweeps x <- b + gamma P x, which always contract.
 
 Both can fail where the discount is near 1: Krylov on graphs that mix slowly, and LU in the digits that float32 has. So
@@ -14,29 +14,39 @@ up to a thousand states: products of non-negative numbers alone, with the rows o
 that nothing cancels whatever the discount. A larger model's solution that fails comes back as NaN, never as a wrong
 number. Derivatives are implicit (one more solve with the transpose), whatever the method.
 
-The batch, if any, is the last axis.
+The batch, if any, is the last axis; a lane is one problem of the batch.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 
-from jaxhom.models.mdp import MDP, expected_next_value, push_forward, state_transition
-from jaxhom.models.policy_chain import policy_chain
+from jaxhom.models.mdp import MDP, state_transition
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Bool, Float
 
 _MAX_LU_STATES = 64  # from here on sweeps of the successor layout are faster
 _MAX_LU_STATES_DENSE = 256  # ... and products with the dense tensor
-_MAX_KRYLOV_STEPS = 1000
-_MAX_SWEEPS = 4000
-_MAX_DOUBLING_STATES = 1024
+_MAX_KRYLOV_STEPS = 1000  # chains that mix take tens; what is left goes to sweeps, and then to doubling or the host
+_MAX_SWEEPS = 4000  # the error falls by gamma with each: to nothing at a discount of 0.99, where 0.99^4000 is 4e-18
+_MAX_DOUBLING_STATES = 1024  # a product of two S x S matrices takes S^3 operations, and there are dozens of them
 _QUICK_STEPS = 200  # of Krylov and sweeps, where something better stands behind
-_CACHED_NUMBERS = 3000  # states times lanes of a batch
+_CACHED_NUMBERS = 3000  # states times lanes of a batch, of which each brings weights on all edges
 
 
 def solve_chain(
-    mdp: MDP, policy: jax.Array, source: jax.Array, *, transpose: bool, is_quick: bool = False
-) -> jax.Array:
+    mdp: MDP,
+    policy: Float[Array, "S A *B"],
+    source: Float[Array, "S *B"],
+    *,
+    transpose: bool,
+    is_quick: bool = False,
+) -> Float[Array, "S *B"]:
     """Solves (I - gamma P_pi) x = source, or its transpose; for use under `jit`, differentiable.
 
     Args:
@@ -51,7 +61,8 @@ def solve_chain(
     """
 
     def solve(policy, source):
-        forward, backward = _products(mdp, policy)
+        chain = mdp.dynamics.chain(policy)
+        forward, backward = chain.push_forward, chain.expected_next_value
         product, transposed = (forward, backward) if transpose else (backward, forward)
 
         def solver(product, transpose):
@@ -67,7 +78,7 @@ def solve_chain(
     return solve(policy, source) if is_solved_by_lu(mdp) else _some_lanes_at_a_time(solve, policy, source)
 
 
-def rough_state_occupancy(mdp: MDP, policy: jax.Array, residual: jax.Array) -> jax.Array:
+def rough_state_occupancy(mdp: MDP, policy: Float[Array, "S A B"], residual: Float[Array, "*B"]) -> Float[Array, "S B"]:
     """State occupancies mu [S, B] of policies [S, A, B], up to a residual of the flow: for inner loops, under `jit`.
 
     Args:
@@ -80,7 +91,7 @@ def rough_state_occupancy(mdp: MDP, policy: jax.Array, residual: jax.Array) -> j
       mu [S, B]; NaN on lanes that missed the residual. Not to be differentiated.
     """
     initial = jnp.broadcast_to(mdp.initial[:, None], (mdp.num_states, policy.shape[2]))
-    forward, _ = _products(mdp, policy)
+    forward = mdp.dynamics.chain(policy).push_forward
     return _solve(mdp, policy, forward, initial, True, residual=residual)
 
 
@@ -89,8 +100,10 @@ def is_solved_by_lu(mdp: MDP) -> bool:
     return mdp.num_states <= (_MAX_LU_STATES_DENSE if mdp.is_dense else _MAX_LU_STATES)
 
 
-def _some_lanes_at_a_time(solve: Callable, policy: jax.Array, source: jax.Array) -> jax.Array:
-    """`solve(policy, source)`, for policies [S, A, B] in batches that a CPU's cache can hold.
+def _some_lanes_at_a_time(
+    solve: Callable, policy: Float[Array, "S A *B"], source: Float[Array, "S *B"]
+) -> Float[Array, "S *B"]:
+    """`solve(policy, source)`, for batches of policies in parts that a CPU's cache can hold.
 
     Every lane brings weights on all edges, so that products of wide batches would wait for memory.
     """
@@ -110,32 +123,9 @@ def _some_lanes_at_a_time(solve: Callable, policy: jax.Array, source: jax.Array)
     return jnp.moveaxis(solved, 0, 1).reshape(num_states, -1)[:, :lanes]
 
 
-def _products(mdp: MDP, policy: jax.Array) -> tuple[Callable, Callable]:
-    """The products with P_pi^T and P_pi."""
-    if not mdp.is_dense:
-        if policy.ndim == 3 and policy.shape[2] == 1:  # gathers of single numbers, not of rows of one
-            return tuple(_on_one_lane(product) for product in _products(mdp, policy[..., 0]))
-        chain = policy_chain(mdp.edges, mdp.probability, policy)
-        return chain.push_forward, chain.expected_next_value
-    if policy.ndim == 2:
-        transition = state_transition(mdp, policy)
-        return lambda mu: mu @ transition, lambda value: transition @ value
-
-    # One matrix for all lanes: its product is worth more than the A times fewer numbers of a matrix per lane.
-    def forward(mu):
-        return push_forward(mdp, mu[:, None] * policy)
-
-    def backward(value):
-        return jnp.einsum("sab,sab->sb", policy, expected_next_value(mdp, value))
-
-    return forward, backward
-
-
-def _on_one_lane(product: Callable) -> Callable:
-    return lambda x: product(x[:, 0])[:, None]
-
-
-def _solve(mdp: MDP, policy, product: Callable, b, transpose: bool, is_quick=False, residual=0.0) -> jax.Array:
+def _solve(
+    mdp: MDP, policy, product: Callable, b, transpose: bool, is_quick=False, residual=0.0
+) -> Float[Array, "S *B"]:
     """Solves x = b + discount * product(x), product being that of the policy's chain or of its transpose."""
     if is_solved_by_lu(mdp):
         x = _solve_by_lu(mdp, policy, b, transpose)
@@ -150,7 +140,7 @@ def _solve(mdp: MDP, policy, product: Callable, b, transpose: bool, is_quick=Fal
     return _mend_by_doubling(mdp, policy, x, b, is_good, transpose)
 
 
-def _solve_by_lu(mdp: MDP, policy: jax.Array, source: jax.Array, transpose: bool) -> jax.Array:
+def _solve_by_lu(mdp: MDP, policy: Float[Array, "S A *B"], source, transpose: bool) -> Float[Array, "S *B"]:
     def solve(policy, source):
         system = jnp.eye(mdp.num_states, dtype=mdp.dtype)
         system -= mdp.discount * state_transition(mdp, policy)
@@ -161,17 +151,17 @@ def _solve_by_lu(mdp: MDP, policy: jax.Array, source: jax.Array, transpose: bool
     return solve(policy, source)
 
 
-def _norm(x: jax.Array) -> jax.Array:
+def _norm(x: Float[Array, "S *B"]) -> Float[Array, "*B"]:
     return jnp.sqrt((x * x).sum(axis=0))
 
 
-def _goal(x: jax.Array, b: jax.Array, residual) -> jax.Array:
+def _goal(x: Float[Array, "S *B"], b: Float[Array, "S *B"], residual) -> Float[Array, "*B"]:
     """Residual to reach per lane, in the 2-norm: at the least a small multiple of what rounding in x and b leaves."""
     return jnp.maximum(residual, 16.0 * jnp.finfo(b.dtype).eps * (_norm(x) + _norm(b)))
 
 
-def _is_accurate(mdp: MDP, product: Callable, x, b, transpose: bool, residual) -> jax.Array:
-    """bool per lane: the residual is small, and so is the error that it allows.
+def _is_accurate(mdp: MDP, product: Callable, x, b, transpose: bool, residual) -> Bool[Array, "*B"]:
+    """Lane by lane: the residual is small, and so is the error that it allows.
 
     |(I - gamma P)^-1| is 1 / (1 - gamma) in the norm of maxima for values, and in that of sums for their transpose.
     Where a rough residual was asked for, it is what counts.
@@ -184,7 +174,7 @@ def _is_accurate(mdp: MDP, product: Callable, x, b, transpose: bool, residual) -
     return is_small & ((norm(missing) <= allowed) | (_norm(missing) <= residual))
 
 
-def _mend_by_doubling(mdp: MDP, policy, x, b, is_good, transpose: bool) -> jax.Array:
+def _mend_by_doubling(mdp: MDP, policy, x, b, is_good, transpose: bool) -> Float[Array, "S *B"]:
     """x, with the lanes that are not good computed anew."""
 
     def mend(policy, x, b, is_good):
@@ -216,7 +206,9 @@ def _mend_by_doubling(mdp: MDP, policy, x, b, is_good, transpose: bool) -> jax.A
     return jax.lax.map(lambda lane: mend(*lane), lanes).T
 
 
-def _bicgstab(system: Callable, b: jax.Array, goal: jax.Array | float, max_steps: int) -> jax.Array:
+def _bicgstab(
+    system: Callable, b: Float[Array, "S *B"], goal: Float[Array, "*B"] | float, max_steps: int
+) -> Float[Array, "S *B"]:
     """Batched BiCGSTAB (van der Vorst 1992) from 0; lanes are the trailing axis and stop one by one.
 
     A lane stops by steps of length 0, which costs nothing, where a choice between old and new arrays would. One that
@@ -257,7 +249,9 @@ def _bicgstab(system: Callable, b: jax.Array, goal: jax.Array | float, max_steps
     return jnp.where(last <= size, x, 0.0)
 
 
-def _sweep_until(sweep: Callable, x: jax.Array, b: jax.Array, residual, max_sweeps: int) -> jax.Array:
+def _sweep_until(
+    sweep: Callable, x: Float[Array, "S *B"], b: Float[Array, "S *B"], residual, max_sweeps: int
+) -> Float[Array, "S *B"]:
     """Applies the contraction `sweep` until its change is small enough on every lane, or for so many times."""
 
     def keep_going(state):

@@ -1,5 +1,7 @@
 """The Bellman flow of a model as a sparse matrix on the host: the constraints of linear programs over occupancies."""
 
+from __future__ import annotations
+
 import numpy as np
 import scipy.sparse
 

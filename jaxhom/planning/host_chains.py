@@ -9,8 +9,11 @@ Rows of T are brought to sum 1 once more, in float64, and 1 - gamma P_pi(s, s) i
 the chance to leave s: nothing cancels, so float32 tables give right values at any discount that float32 can hold.
 """
 
+from __future__ import annotations
+
 import functools
 import weakref
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -22,19 +25,24 @@ import scipy.sparse.linalg
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
 
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
 _NARROW = 8.0  # bandwidth, in square roots of S, up to which elimination fills in little: roads, grids, corridors
 _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
+# Up to these a solve on the host takes less time than a program's compiling, half a second; above such a discount less
+# than the hundreds of products of an iteration.
 _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _latest: dict = {}  # one entry at most
 
 
-def is_at_hand(*trees) -> bool:
+def is_at_hand(*trees: Any) -> bool:
     """Whether work on these arrays can be done on the host: they are concrete, and JAX computes on this CPU."""
     return not checks.is_traced(*trees) and jax.default_backend() == "cpu"
 
 
-def host_model(mdp: MDP) -> "HostModel":
+def host_model(mdp: MDP) -> HostModel:
     """The model on the host; that of the latest model is kept as long as its arrays are."""
     array, discount, model = _latest.get("model", (lambda: None, None, None))
     if array() is not mdp.probability or discount is not mdp.discount:
@@ -59,21 +67,14 @@ class HostModel:
         pairs = self.num_states * self.num_actions
         probability = np.asarray(mdp.probability, np.float64).reshape(pairs, -1)
         probability = probability / _or_one(probability.sum(axis=1))[:, None]
-        if mdp.is_dense:
-            self.rows = probability
-            return
-        is_entry = probability > 0
-        counts = np.append(0, is_entry.sum(axis=1))
-        successors = np.asarray(mdp.next_state).reshape(pairs, -1)[is_entry]
-        entries = (probability[is_entry], successors, np.cumsum(counts))
-        self.rows = scipy.sparse.csr_array(entries, shape=(pairs, self.num_states))
+        self.rows = mdp.dynamics.host_matrix(probability.reshape(mdp.probability.shape))
 
-    def expected_next_value(self, value: np.ndarray) -> np.ndarray:
-        """E[value(s') | s, a], [S] -> [S, A]."""
+    def expected_next_value(self, value: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S A"]:
+        """E[value(s') | s, a]."""
         return (self.rows @ value).reshape(self.num_states, self.num_actions)
 
-    def chain(self, policy: np.ndarray) -> "HostChain":
-        """The chain of a policy [S, A], or of the actions [S] that a deterministic one takes."""
+    def chain(self, policy: Float[np.ndarray, "S A"] | Int[np.ndarray, " S"]) -> HostChain:
+        """The chain of a policy, or of the actions that a deterministic one takes."""
         states = np.arange(self.num_states)
         if policy.ndim == 1:
             return HostChain(self.rows[states * self.num_actions + policy], self.discount)
@@ -126,7 +127,7 @@ class HostModel:
 class HostChain:
     """One chain P_pi, factorised: solves with I - gamma P_pi and with its transpose."""
 
-    def __init__(self, transition, discount: float):
+    def __init__(self, transition: Float[np.ndarray, "S S"] | scipy.sparse.csr_array, discount: float):
         self._discount = discount
         if not scipy.sparse.issparse(transition):
             self._transition = transition / _or_one(transition.sum(axis=1))[:, None]
@@ -149,12 +150,12 @@ class HostChain:
             columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
 
-    def value(self, reward: np.ndarray) -> np.ndarray:
-        """V of rewards r_pi, [S] -> [S]; NaN where rounding leaves more than a thousandth open."""
+    def value(self, reward: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
+        """V of rewards r_pi; NaN where rounding leaves more than a thousandth open."""
         return self._checked(reward, is_flow=False)
 
-    def state_occupancy(self, initial: np.ndarray) -> np.ndarray:
-        """mu of an initial distribution, [S] -> [S]; likewise."""
+    def state_occupancy(self, initial: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
+        """mu of an initial distribution; likewise."""
         return np.maximum(self._checked(initial, is_flow=True), 0.0)
 
     def _checked(self, right: np.ndarray, is_flow: bool) -> np.ndarray:

@@ -11,10 +11,14 @@ Concrete policies on graphs like roads, grids and corridors are solved by sparse
 `chain_solver`. A solution that nobody can vouch for (a policy that holds NaN, say) comes back as NaN, never as a wrong
 number. Derivatives are implicit (one more solve with the transpose), whatever the method.
 
-Policies are [S, A] or a batch [B, S, A]; inside, the batch is the last axis.
+Policies are [S, A] or a batch [B, S, A]; inside, the batch is the last axis. The way back, from an occupancy to the
+policy that has it, is eq. (5).
 """
 
+from __future__ import annotations
+
 import functools
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -26,19 +30,34 @@ from jaxhom.models.mdp import MDP
 from jaxhom.planning.chain_solver import solve_chain
 from jaxhom.planning.host_chains import host_model, is_at_hand
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-def occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
+    Policy = Float[ArrayLike, "*B S A"] | Int[ArrayLike, " S"]
+
+NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0: what solvers leave where nothing goes
+
+
+def occupancy(mdp: MDP, policy: Policy) -> Float[Array, "*B S A"]:
     """Discounted state-action occupancy x(s, a) = E sum_t gamma^t 1[s_t = s, a_t = a].
+
+    Works under `jit`, `vmap` and `grad`, in the policy and in all numbers of the model.
 
     Args:
       mdp: the model.
-      policy: [S, A] or [B, S, A], rows sum to 1.
+      policy: [S, A] or [B, S, A], rows sum to 1; integers [S] are the actions of one that is deterministic.
 
     Returns:
       [S, A] or [B, S, A]; each sums to 1 / (1 - discount).
 
     Raises:
-      ValueError: if `policy` has another shape.
+      ValueError: if `policy` has another shape, or is concrete and no policy.
+
+    Example:
+      >>> from jaxhom import MDP
+      >>> mdp = MDP.from_dense([[[0.0, 1.0]], [[0.0, 1.0]]], discount=0.5, initial=[1, 0])
+      >>> occupancy(mdp, [[1.0], [1.0]]).tolist()  # one step in state 0, all others in state 1
+      [[1.0], [1.0]]
 
     Source: Boularias and Chaib-draa 2010, section II and eqs. (3)-(4).
     """
@@ -51,18 +70,26 @@ def occupancy(mdp: MDP, policy: jax.Array) -> jax.Array:
     return _occupancy(mdp, policy)
 
 
-def feature_expectations(mdp: MDP, policy: jax.Array) -> jax.Array:
+def feature_expectations(mdp: MDP, policy: Policy) -> Float[Array, "*B K"]:
     """Discounted feature expectations V_i(pi) = sum_{s, a} x_pi(s, a) phi_i(s, a).
+
+    Works under `jit`, `vmap` and `grad`, as `occupancy`.
 
     Args:
       mdp: the model, with K features.
-      policy: [S, A] or [B, S, A], rows sum to 1.
+      policy: [S, A] or [B, S, A], rows sum to 1; or integers [S].
 
     Returns:
       [K] or [B, K]; divide by 1 / (1 - discount) for a weighted average per step.
 
     Raises:
-      ValueError: if `policy` has another shape.
+      ValueError: if `policy` has another shape, or is concrete and no policy.
+
+    Example:
+      >>> from jaxhom import MDP
+      >>> mdp = MDP.from_dense([[[0.0, 1.0]], [[0.0, 1.0]]], discount=0.5, initial=[1, 0], features=[[3.0], [5.0]])
+      >>> feature_expectations(mdp, [[1.0], [1.0]]).tolist()
+      [8.0]
 
     Source: Boularias and Chaib-draa 2010, section II.
     """
@@ -70,19 +97,27 @@ def feature_expectations(mdp: MDP, policy: jax.Array) -> jax.Array:
     return jnp.einsum("...sa,sak->...k", occupancy(mdp, policy), mdp.features)
 
 
-def policy_value(mdp: MDP, policy: jax.Array, reward: jax.Array) -> jax.Array:
+def policy_value(mdp: MDP, policy: Policy, reward: Float[ArrayLike, "*B S A"]) -> Float[Array, "*B S"]:
     """State values V(s) = E[sum_t gamma^t r(s_t, a_t) | s_0 = s] of a policy.
+
+    Works under `jit`, `vmap` and `grad`, in policy, reward and all numbers of the model.
 
     Args:
       mdp: the model.
-      policy: [S, A] or [B, S, A], rows sum to 1.
+      policy: [S, A] or [B, S, A], rows sum to 1; or integers [S].
       reward: [S, A], or [B, S, A] beside a batch of policies.
 
     Returns:
-      [S] or [B, S].
+      [S] or [B, S], in units of reward, discounted sums: up to 1 / (1 - discount) times the largest reward.
 
     Raises:
-      ValueError: if the shapes do not fit.
+      ValueError: if the shapes do not fit, or concrete values are no policy or no finite reward.
+
+    Example:
+      >>> from jaxhom import MDP
+      >>> mdp = MDP.from_dense([[[0.0, 1.0]], [[0.0, 1.0]]], discount=0.5)
+      >>> policy_value(mdp, [[1.0], [1.0]], [[3.0], [5.0]]).tolist()
+      [8.0, 10.0]
 
     Source: Boularias and Chaib-draa 2010, section II.
     """
@@ -97,6 +132,41 @@ def policy_value(mdp: MDP, policy: jax.Array, reward: jax.Array) -> jax.Array:
         batch_last = jnp.moveaxis(policy, 0, -1)
         return _solve_values(mdp, batch_last, reward_under_policy.T).T
     return _solve_values(mdp, policy, reward_under_policy)
+
+
+def policy_from_occupancy(
+    mdp: MDP,
+    x: Float[Array, "*B S A"] | Float[np.ndarray, "*B S A"],
+    fallback: Float[ArrayLike, "*B S A"],
+    negligible: float = NO_OCCUPANCY,
+) -> Float[Array, "*B S A"]:
+    """pi(s, a) = x(s, a) / sum_a' x(s, a'), eq. (5); `fallback` where the state's share of all time is negligible.
+
+    Works under `jit` and `vmap`; in NumPy if x is a NumPy array.
+
+    Args:
+      mdp: the model, of which only the discount is read.
+      x: [..., S, A], occupancies that sum to 1 / (1 - discount), as solvers leave them: entries below 0 count as 0.
+      fallback: [..., S, A], a policy for states that do not occur.
+      negligible: the share, see `has_occupancy`.
+
+    Returns:
+      [..., S, A], rows sum to 1.
+
+    Source: Boularias and Chaib-draa 2010, eq. (5).
+    """
+    numpy = np if isinstance(x, np.ndarray) else jnp
+    x = numpy.maximum(x, 0.0)
+    occurs = has_occupancy(mdp, x, negligible)[..., None]
+    return numpy.where(occurs, x / numpy.where(occurs, x.sum(axis=-1, keepdims=True), 1.0), fallback)
+
+
+def has_occupancy(
+    mdp: MDP, x: Float[Array, "*B S A"] | Float[np.ndarray, "*B S A"], negligible: float = NO_OCCUPANCY
+) -> Bool[Array, "*B S"]:
+    """The states whose share of all discounted time, sum_a x(s, a) (1 - gamma), is above `negligible`; else 0 / 0."""
+    discount = float(mdp.discount) if isinstance(x, np.ndarray) else mdp.discount
+    return x.sum(axis=-1) > negligible / (1.0 - discount)
 
 
 @functools.partial(jax.jit, static_argnames="is_quick")

@@ -8,17 +8,22 @@ and how far the values of the states differ that they lead to. A reward of -1e6 
 share, decides nothing.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.sparse
 
 from jaxhom.planning.host_chains import HostModel
 
-_MAX_IMPROVEMENTS = 1000
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+_MAX_IMPROVEMENTS = 1000  # never needed: it ends a loop that rounding might keep going
 _SWEEPS = 100  # between two solves, at most: as long as they change the policy
-_ROUNDINGS = 16.0  # of the model's type, in rewards and differences of values
-_ROUNDINGS_OF_VALUES = 64.0  # of float64, in the values themselves
+_ROUNDINGS = 16.0  # of the model's type, in rewards and differences of values: a backup adds a few of each up
+_ROUNDINGS_OF_VALUES = 64.0  # of float64, in the values themselves, which come from a factorisation
 
 
 class HostPlan(NamedTuple):
@@ -32,15 +37,21 @@ class HostPlan(NamedTuple):
       is_settled: whether no action is better; otherwise rounding or the limit came first.
     """
 
-    actions: np.ndarray
-    value: np.ndarray
-    action_value: np.ndarray
+    actions: Int[np.ndarray, " S"]
+    value: Float[np.ndarray, " S"]
+    action_value: Float[np.ndarray, "S A"]
     residual: float
     iterations: int
     is_settled: bool
 
 
-def iterate(model: HostModel, reward: np.ndarray, actions: np.ndarray, eps: float, limit: int = _MAX_IMPROVEMENTS):
+def iterate(
+    model: HostModel,
+    reward: Float[np.ndarray, "S A"],
+    actions: Int[np.ndarray, " S"],
+    eps: float,
+    limit: int = _MAX_IMPROVEMENTS,
+) -> HostPlan | None:
     """Improves a policy until no action is better.
 
     Args:

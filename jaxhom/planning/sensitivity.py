@@ -10,14 +10,22 @@ are those of the same value. At ties V* has a kink, and what comes out is the de
 in the reward, in which V* is convex, a subgradient.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 
 from jaxhom.models.mdp import MDP, expected_next_value
 from jaxhom.planning.occupancy import policy_value
+from jaxhom.planning.plan import Plan
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
 
 
-def with_derivatives(mdp: MDP, reward: jax.Array, plan):
+def with_derivatives(mdp: MDP, reward: Float[Array, "*B S A"], plan: Plan) -> Plan:
     """The plan with values that JAX can differentiate by model and reward; the policy is a constant.
 
     Works under jit, vmap and grad, and costs nothing where nothing is differentiated.
@@ -25,7 +33,7 @@ def with_derivatives(mdp: MDP, reward: jax.Array, plan):
     Args:
       mdp: the model.
       reward: [S, A] or [B, S, A].
-      plan: a `jaxhom.planning.optimal.Plan` for them, made from `jax.lax.stop_gradient` of model and reward.
+      plan: the plan for them, made from `jax.lax.stop_gradient` of model and reward.
 
     Returns:
       The plan; its `value` and `action_value` have derivatives.

@@ -14,9 +14,12 @@ sums it up. Every measure is then linear in the visits sum_t d_t(s) pi(s, a), so
 of them. `evaluate_by_sampling` runs trials, as the paper does, and reports standard errors.
 """
 
+from __future__ import annotations
+
 import functools
 import operator
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +30,11 @@ from jaxhom.models.demonstrations import sample_demonstrations
 from jaxhom.models.inputs import as_model, check_policy, check_reward, require_policy_shape
 from jaxhom.models.mdp import MDP, push_forward
 from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
+
+    Policy = Float[ArrayLike, "*B S A"] | Int[ArrayLike, " S"]
 
 
 class Evaluation(Record):
@@ -42,22 +50,22 @@ class Evaluation(Record):
       standard_error: the same measures' standard errors, or None where the evaluation is exact.
     """
 
-    reward_per_step: jax.Array
-    total_reward: jax.Array
-    steps: jax.Array
-    finished: jax.Array
-    events: dict[str, jax.Array]
-    standard_error: "Evaluation | None" = None
+    reward_per_step: Float[Array, "*B"]
+    total_reward: Float[Array, "*B"]
+    steps: Float[Array, "*B"]
+    finished: Float[Array, "*B"]
+    events: dict[str, Float[Array, "*B"]]
+    standard_error: Evaluation | None = None
 
 
 def evaluate_exactly(
     mdp: MDP,
-    policy: jax.Array,
-    reward: jax.Array,
+    policy: Policy,
+    reward: Float[ArrayLike, "*B S A"],
     horizon: int,
     *,
-    terminal: jax.Array | None = None,
-    events: Mapping[str, jax.Array] | None = None,
+    terminal: Bool[ArrayLike, " S"] | None = None,
+    events: Mapping[str, Float[ArrayLike, "S A"]] | None = None,
     count_terminal_step: bool = False,
 ) -> Evaluation:
     """Computes what a policy achieves in trials of at most `horizon` steps, without sampling.
@@ -101,24 +109,27 @@ def evaluate_exactly(
         _batch_last(reward),
         terminal,
         events,
-        horizon=_require_count("horizon", horizon, 1),
+        horizon=checks.require_count("horizon", horizon),
         count_terminal_step=bool(count_terminal_step),
     )
 
 
 def evaluate_by_sampling(
-    key: jax.Array,
+    key: Key[Array, ""],
     mdp: MDP,
-    policy: jax.Array,
-    reward: jax.Array,
+    policy: Policy,
+    reward: Float[ArrayLike, "*B S A"],
     horizon: int,
     *,
     num_trials: int = 1000,
-    terminal: jax.Array | None = None,
-    events: Mapping[str, jax.Array] | None = None,
+    terminal: Bool[ArrayLike, " S"] | None = None,
+    events: Mapping[str, Float[ArrayLike, "S A"]] | None = None,
     count_terminal_step: bool = False,
 ) -> Evaluation:
     """Estimates what a policy achieves from independent trials of at most `horizon` steps.
+
+    Works under `jit` and `vmap`, with the counts static. Under `grad` the trials are constants: only the derivative in
+    `reward` and `events` is that of the expectation.
 
     What a trial adds up are expectations given its states and actions: `reward` and `events` are
     [S, A], so that the luck of a step's outcome is in where the trial goes on and nowhere else.
@@ -146,12 +157,21 @@ def evaluate_by_sampling(
     Raises:
       ValueError: as `evaluate_exactly`, and if `num_trials` is below 2.
 
+    Example:
+      >>> from jaxhom.domains.gridworld import gridworld
+      >>> mdp = gridworld(4, noise=0.0).mdp
+      >>> at_goal = jnp.arange(16) == 15
+      >>> to_goal = jnp.where(jnp.arange(16) < 12, 1, 3)  # down, then right
+      >>> found = evaluate_by_sampling(jax.random.key(0), mdp, to_goal, jnp.ones((16, 4)), 10, terminal=at_goal)
+      >>> float(found.steps), float(found.finished), float(found.standard_error.steps)
+      (6.0, 1.0, 0.0)
+
     Source: Boularias and Chaib-draa 2010, section VI; they report no errors.
     """
     mdp = as_model(mdp)
     policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
-    horizon = _require_count("horizon", horizon, 1)
-    num_trials = _require_count("num_trials", num_trials, 2)
+    horizon = checks.require_count("horizon", horizon)
+    num_trials = checks.require_count("num_trials", num_trials, least=2)
 
     def evaluate(policy, reward):
         # One state more than steps: the last step of a trial may be the one that finishes it.
@@ -163,8 +183,12 @@ def evaluate_by_sampling(
     return evaluate(policy, reward)
 
 
-def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: jax.Array | None = None) -> jax.Array:
+def agreement(
+    mdp: MDP, policy: Policy, expert_policy: Policy, weights: Float[ArrayLike, "*B S"] | None = None
+) -> Float[Array, "*B"]:
     """Probability that a policy takes the expert's action, averaged over states.
+
+    Works under `jit`, `vmap` and `grad`.
 
     In state s it is sum_a min(pi(s, a), pi_E(s, a)), one minus the total variation distance of the
     two rows: the largest probability with which draws from the two can be made to coincide. Between
@@ -183,6 +207,12 @@ def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: ja
 
     Raises:
       ValueError: if a shape does not fit, or a weight is negative or not finite.
+
+    Example:
+      >>> from jaxhom import MDP
+      >>> mdp = MDP.from_dense([[[1.0, 0.0], [0.0, 1.0]]] * 2, discount=0.9)
+      >>> float(agreement(mdp, [[0.75, 0.25], [0.0, 1.0]], [0, 0]))
+      0.375
     """
     mdp = as_model(mdp)
     policy = require_policy_shape(mdp, policy)
@@ -202,7 +232,7 @@ def agreement(mdp: MDP, policy: jax.Array, expert_policy: jax.Array, weights: ja
 
 
 @functools.partial(jax.jit, static_argnames=("horizon", "count_terminal_step"))
-def _evaluate_visits(mdp, policy, reward, terminal, events, *, horizon, count_terminal_step):
+def _evaluate_visits(mdp, policy, reward, terminal, events, *, horizon, count_terminal_step) -> Evaluation:
     """`evaluate_exactly` with the batch, if any, last: policy and reward [S, A] or [S, A, B]."""
     spread = (...,) + (None,) * (policy.ndim - 2)
     ends = terminal.astype(mdp.dtype)[spread]
@@ -235,7 +265,7 @@ def _evaluate_visits(mdp, policy, reward, terminal, events, *, horizon, count_te
 
 
 @functools.partial(jax.jit, static_argnames="count_terminal_step")
-def _evaluate_trials(trials, reward, terminal, events, *, count_terminal_step):
+def _evaluate_trials(trials, reward, terminal, events, *, count_terminal_step) -> Evaluation:
     """Means and standard errors of trials [M, H + 1] of one policy."""
     horizon, dtype = trials.horizon - 1, reward.dtype
     is_terminal = terminal[trials.states]
@@ -259,19 +289,19 @@ def _evaluate_trials(trials, reward, terminal, events, *, count_terminal_step):
     return mean.replace(standard_error=error)
 
 
-def _mean(samples: jax.Array) -> jax.Array:
-    """Mean over trials and its standard error, [M] -> [2]."""
+def _mean(samples: Float[Array, " M"]) -> Float[Array, " 2"]:
+    """Mean over trials and its standard error."""
     return jnp.stack([samples.mean(), samples.std(ddof=1) / jnp.sqrt(len(samples))])
 
 
-def _ratio(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
-    """Ratio of the means of two [M] samples and its standard error by the delta method, [2]."""
+def _ratio(numerator: Float[Array, " M"], denominator: Float[Array, " M"]) -> Float[Array, " 2"]:
+    """Ratio of the means of two samples and its standard error by the delta method."""
     ratio = numerator.mean() / denominator.mean()
     _, error = _mean(numerator - ratio * denominator)
     return jnp.stack([ratio, error / denominator.mean()])
 
 
-def _batch_last(array: jax.Array) -> jax.Array:
+def _batch_last(array: Float[Array, "*B S A"]) -> Float[Array, "S A *B"]:
     """[S, A] as it is, [B, S, A] -> [S, A, B]."""
     return jnp.moveaxis(array, 0, -1) if array.ndim == 3 else array
 
@@ -289,14 +319,3 @@ def _validated(mdp: MDP, policy, reward, terminal, events):
     for name, event in events.items():
         checks.require_shape(f"events[{name!r}]", event, str(pair), event.shape == pair)
     return check_policy(mdp, policy), reward, terminal, events
-
-
-def _require_count(name: str, count, least: int) -> int:
-    """Returns `count` as an int of at least `least`, or raises."""
-    try:
-        count = operator.index(count)
-    except TypeError:
-        raise ValueError(f"{name} must be a whole number, got {count!r}") from None
-    if count < least:
-        raise ValueError(f"{name} must be at least {least}, got {count}")
-    return count

@@ -13,7 +13,6 @@ import small_models
 
 from jaxhom import LPAL, MDP, Status, gridworld, lpal
 from jaxhom.apprenticeship import certificate, column_rounds, flow, interior_point, presolve, quickest
-from jaxhom.apprenticeship.certificate import policy_from_occupancy
 
 METHODS = ["columns", "flow", "interior_point", "auto"]
 
@@ -324,15 +323,6 @@ def test_progress_is_shown_when_asked_for(method, capsys):
     assert capsys.readouterr().err == ""
     lpal(here.mdp, here.expectations, method=method, max_iterations=2, progress=True)
     assert "LPAL" in capsys.readouterr().err
-
-
-def test_policy_from_occupancy():
-    """Eq. (5); negative entries are rounding, and where nothing happens the fallback rules."""
-    mdp = MDP.from_dense(np.repeat(np.eye(4)[:, None], 2, axis=1), discount=0.9)
-    x = jnp.array([[[3.0, 1.0], [2.0, -1e-12], [0.0, 0.0], [1e-12, 0.0]]])
-    fallback = jnp.array([[[0.0, 1.0]] * 4])
-    expected = [[0.75, 0.25], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]
-    np.testing.assert_array_equal(policy_from_occupancy(mdp, x, fallback)[0], expected)
 
 
 # ------------------------------------------------------------------------------ what is refused

@@ -11,7 +11,7 @@ import oracles
 import pytest
 import small_models
 
-from jaxhom.models import demonstrations as demonstrations_module
+from jaxhom.models import sampling
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -332,7 +332,7 @@ def test_sampled_frequencies(name, dtype, rng):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_edges_of_the_inverse_cdf(cumulative, uniform, expected, dtype):
     """An index without probability is not drawn even where the uniform number meets a boundary."""
-    inverse_cdf = jax.jit(demonstrations_module._inverse_cdf)
+    inverse_cdf = jax.jit(sampling._inverse_cdf)
     index = inverse_cdf(np.asarray(cumulative, dtype), dtype(uniform))
     assert index == expected
 

@@ -6,7 +6,7 @@ import pytest
 
 import jaxhom
 from jaxhom import MDP
-from jaxhom.models.inputs import check_policy
+from jaxhom.models.inputs import check_coordinates, check_policy
 from jaxhom.models.mdp import absorbing_states, uniform_policy
 
 # Two states, three actions; action 2 exists in state 1 alone, where it stays.
@@ -169,3 +169,19 @@ def test_where_a_model_is_meant_what_has_one_will_do():
     np.testing.assert_array_equal(jaxhom.occupancy(world, plan), jaxhom.occupancy(world.mdp, plan.policy))
     with pytest.raises(ValueError, match=r"a jaxhom.MDP is needed, or what has one as .mdp, got dict"):
         jaxhom.occupancy({}, plan)
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "message"),
+    [
+        ([0.0, 1.0], r"coordinates must have shape \(2, D\), got \(2,\)"),
+        ([[0.0]], r"coordinates must have shape \(2, D\), got \(1, 1\)"),
+        ([[0.0], [np.nan]], r"coordinates\[1, 0\] must be finite"),
+        ([[0.0], [0.0, 1.0]], "not a rectangular array"),
+    ],
+)
+def test_coordinates_that_do_not_fit_are_refused(coordinates, message):
+    mdp = MDP.from_dense(np.eye(2)[:, None], discount=0.9)
+    with pytest.raises(ValueError, match=message):
+        check_coordinates(mdp, coordinates)
+    assert check_coordinates(mdp, [[1], [2]]).dtype == np.float64

@@ -44,15 +44,15 @@ def as_successors(transition, rng, extra=2):
 def test_layout(name, is_dense, has_wide_pairs, has_wide_rows):
     mdp = small_models.case(name).mdp
     assert mdp.is_dense == is_dense
-    assert (mdp.wide_pairs.size > 0) == has_wide_pairs
-    assert mdp.is_dense or (mdp.predecessors.wide_row.size > 0) == has_wide_rows
+    assert mdp.is_dense or (mdp.dynamics.wide_pairs.size > 0) == has_wide_pairs
+    assert mdp.is_dense or (mdp.dynamics.predecessors.wide_row.size > 0) == has_wide_rows
 
 
 def test_restart_rows_alone_are_wide():
     mdp = small_models.case("restart").mdp
-    assert mdp.narrow_width == 3
-    np.testing.assert_array_equal(mdp.wide_pairs, 3 * np.arange(95, 100) + 2)
-    np.testing.assert_array_equal(np.unique(mdp.predecessors.wide_row), [0])
+    assert mdp.dynamics.narrow_width == 3
+    np.testing.assert_array_equal(mdp.dynamics.wide_pairs, 3 * np.arange(95, 100) + 2)
+    np.testing.assert_array_equal(np.unique(mdp.dynamics.predecessors.wide_row), [0])
 
 
 @pytest.mark.parametrize("is_shared", [True, False])
@@ -63,9 +63,9 @@ def test_expectations_over_wide_rows(is_shared, rng):
         for state in range(95, 100):
             transition[state, 2] = np.roll(transition[state, 2], state)
     mdp = MDP.from_dense(transition, discount=discount, initial=initial, features=features)
-    assert (mdp.wide_successors is not None) == is_shared
+    assert (mdp.dynamics.wide_successors is not None) == is_shared
     if is_shared:
-        np.testing.assert_array_equal(mdp.wide_successors, np.arange(10, 34))
+        np.testing.assert_array_equal(mdp.dynamics.wide_successors, np.arange(10, 34))
     for value in (rng.normal(size=100), rng.normal(size=(100, 1)), rng.normal(size=(100, 4))):
         expected = np.tensordot(transition, value, axes=1)
         np.testing.assert_allclose(jax.jit(expected_next_value)(mdp, value), expected, rtol=0, atol=1e-14)

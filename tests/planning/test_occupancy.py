@@ -18,7 +18,13 @@ import small_models
 from jaxhom import MDP
 from jaxhom.planning import chain_solver
 from jaxhom.planning import occupancy as occupancy_module
-from jaxhom.planning.occupancy import feature_expectations, occupancy, policy_value
+from jaxhom.planning.occupancy import (
+    feature_expectations,
+    has_occupancy,
+    occupancy,
+    policy_from_occupancy,
+    policy_value,
+)
 
 SOLVERS = ["dense", "sparse", "restart", "dense_krylov"]
 
@@ -440,3 +446,25 @@ def test_wide_batches_are_solved_some_lanes_at_a_time(monkeypatch, rng):
         np.testing.assert_allclose(gradient[i], alone, rtol=0, atol=1e-8)
     for solve in (occupancy_module._occupancy, occupancy_module._solve_values):
         solve.clear_cache()
+
+
+# ------------------------------------------------------------------------- from occupancies to policies
+
+
+@pytest.mark.parametrize("numpy", [np, jnp])
+def test_policies_are_read_off_occupancies(numpy):
+    """Eq. (5); negative entries are rounding, and where nothing happens the fallback rules."""
+    mdp = MDP.from_dense(np.repeat(np.eye(4)[:, None], 2, axis=1), discount=0.9)
+    x = numpy.asarray([[3.0, 1.0], [2.0, -1e-12], [0.0, 0.0], [1e-12, 0.0]])
+    found = policy_from_occupancy(mdp, x, np.array([[0.0, 1.0]] * 4))
+    np.testing.assert_array_equal(found, [[0.75, 0.25], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    assert has_occupancy(mdp, x).tolist() == [True, True, False, False]
+    np.testing.assert_array_equal(policy_from_occupancy(mdp, x[None], found, 1e-14)[0, 3], [1.0, 0.0])
+
+
+def test_an_occupancy_has_the_policy_that_it_came_from(rng):
+    case = small_models.case("restart")
+    policy = small_models.random_policy(rng, *case.shape)
+    x = occupancy(case.mdp, policy)
+    expected = np.where(has_occupancy(case.mdp, x)[:, None], policy, 0.5)
+    np.testing.assert_allclose(jax.jit(policy_from_occupancy)(case.mdp, x, 0.5), expected, rtol=0, atol=1e-9)

@@ -13,7 +13,8 @@ import small_models
 
 from jaxhom.domains.gridworld import gridworld
 from jaxhom.models.mdp import MDP
-from jaxhom.planning.optimal import Plan, greedy_policy, optimal_policy
+from jaxhom.planning.optimal import optimal_policy
+from jaxhom.planning.plan import Plan, greedy_policy
 from jaxhom.status import Status
 
 BOTH_WAYS = pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["concrete", "jit"])

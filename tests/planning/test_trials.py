@@ -10,6 +10,7 @@ import oracles
 import pytest
 
 from jaxhom.domains.racetrack import racetrack
+from jaxhom.models.dense_tensor import DenseTensor
 from jaxhom.models.mdp import MDP
 from jaxhom.planning import trials as evaluation
 from jaxhom.planning.optimal import optimal_policy
@@ -219,15 +220,9 @@ def test_one_reward_serves_a_batch_of_policies(case):
 
 def test_the_dense_layout_is_the_sparse_one(case):
     transition, _ = case["numpy"]
-    dense = dataclasses.replace(
-        case["mdp"],
-        probability=jnp.asarray(transition),
-        next_state=jnp.broadcast_to(jnp.arange(S), transition.shape),
-        predecessors=None,
-        edges=None,
-        narrow_width=S,
-        wide_successors=None,
-    )
+    states = jnp.broadcast_to(jnp.arange(S), transition.shape)
+    dynamics = DenseTensor(next_state=states, probability=jnp.asarray(transition))
+    dense = dataclasses.replace(case["mdp"], dynamics=dynamics)
     assert dense.is_dense
     assert not case["mdp"].is_dense
     for policy in (case["policies"], case["policies"][0]):

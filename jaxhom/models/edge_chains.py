@@ -6,14 +6,19 @@ for the Markov chain of a policy, P_pi(s, s') = sum_a pi(s, a) T(s, a, s'), forw
 time, backward, with as many weights per edge as there are actions.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.models.padded_rows import PaddedRows, gather_sum, pad_rows, sum_rows
+from jaxhom.models.padded_rows import MAX_UNROLLED_ACTIONS, PaddedRows, gather_sum, pad_rows, sum_rows
 from jaxhom.status import Record
 
-_MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float, Int
 
 
 class Edges(Record):
@@ -26,9 +31,9 @@ class Edges(Record):
       outgoing: the edges of every state s; E as sentinel. incoming: those of every s'.
     """
 
-    source: jax.Array
-    target: jax.Array
-    entry: jax.Array
+    source: Int[Array, " E"]
+    target: Int[Array, " E"]
+    entry: Int[Array, "E A"]
     outgoing: PaddedRows
     incoming: PaddedRows
 
@@ -41,13 +46,27 @@ class PolicyChain(Record):
     predecessor: PaddedRows
     predecessor_weight: PaddedRows
 
-    def expected_next_value(self, value: jax.Array) -> jax.Array:
-        """P_pi v, [S] -> [S] or [S, B] -> [S, B]."""
+    def expected_next_value(self, value: Float[Array, "S *B"]) -> Float[Array, "S *B"]:
+        """P_pi v."""
         return sum_rows(self.successor, self.successor_weight, value)
 
-    def push_forward(self, occupancy: jax.Array) -> jax.Array:
-        """P_pi^T mu, [S] -> [S] or [S, B] -> [S, B]."""
+    def push_forward(self, occupancy: Float[Array, "S *B"]) -> Float[Array, "S *B"]:
+        """P_pi^T mu."""
         return sum_rows(self.predecessor, self.predecessor_weight, occupancy)
+
+
+class OneLane(Record):
+    """The chain of one policy for arrays whose trailing axis is a batch of one."""
+
+    chain: PolicyChain
+
+    def expected_next_value(self, value: Float[Array, "S 1"]) -> Float[Array, "S 1"]:
+        """P_pi v."""
+        return self.chain.expected_next_value(value[:, 0])[:, None]
+
+    def push_forward(self, occupancy: Float[Array, "S 1"]) -> Float[Array, "S 1"]:
+        """P_pi^T mu."""
+        return self.chain.push_forward(occupancy[:, 0])[:, None]
 
 
 class ActionChains(Record):
@@ -59,14 +78,14 @@ class ActionChains(Record):
       wide_row, wide, wide_weight: int32 [J], int32 [J, V] and [A, J, V], what is beyond U; see `PaddedRows`.
     """
 
-    successor: jax.Array
-    weight: jax.Array
-    wide_row: jax.Array
-    wide: jax.Array
-    wide_weight: jax.Array
+    successor: Int[Array, "U S"]
+    weight: Float[Array, "A U S"]
+    wide_row: Int[Array, " J"]
+    wide: Int[Array, "J V"]
+    wide_weight: Float[Array, "A J V"]
 
-    def expected_next_values(self, value: jax.Array) -> list[jax.Array]:
-        """A arrays E[v(s') | s, a], [S] -> [S] or [S, B] -> [S, B]."""
+    def expected_next_values(self, value: Float[Array, "S *B"]) -> list[Float[Array, "S *B"]]:
+        """A arrays E[v(s') | s, a]."""
         spread = (..., None) if value.ndim == 2 else ...
         gathered = [value[states] for states in self.successor]
         expected = [
@@ -78,8 +97,8 @@ class ActionChains(Record):
         return [one.at[self.wide_row].add(more) for one, more in zip(expected, beyond, strict=True)]
 
 
-def find_edges(next_state: np.ndarray, probability: np.ndarray) -> Edges:
-    """The edges of successors [S, A, N] without repetitions in a row."""
+def find_edges(next_state: Int[np.ndarray, "S A N"], probability: Float[np.ndarray, "S A N"]) -> Edges:
+    """The edges of successors without repetitions in a row; on the host."""
     num_states, num_actions, slots = next_state.shape
     used = np.flatnonzero(probability > 0)
     pair = used // slots
@@ -98,11 +117,11 @@ def find_edges(next_state: np.ndarray, probability: np.ndarray) -> Edges:
     )
 
 
-def policy_chain(edges: Edges, probability: jax.Array, policy: jax.Array) -> PolicyChain:
-    """The chain of a policy [S, A], or of a batch that comes last, [S, A, B], for probabilities [S, A, N]."""
+def policy_chain(edges: Edges, probability: Float[Array, "S A N"], policy: Float[Array, "S A *B"]) -> PolicyChain:
+    """The chain of a policy, or of a batch that comes last."""
     entries = jnp.append(probability.ravel(), jnp.zeros((), probability.dtype))  # the sentinel's 0
     batch = policy.shape[2:]
-    if policy.shape[1] > _MAX_UNROLLED_ACTIONS:
+    if policy.shape[1] > MAX_UNROLLED_ACTIONS:
         weight = jnp.einsum("ea...,ea->e...", policy[edges.source], entries[edges.entry])
     else:
         weight = sum(
@@ -119,8 +138,8 @@ def policy_chain(edges: Edges, probability: jax.Array, policy: jax.Array) -> Pol
     )
 
 
-def action_chains(edges: Edges, probability: jax.Array) -> ActionChains:
-    """The chains of all actions, for probabilities [S, A, N]."""
+def action_chains(edges: Edges, probability: Float[Array, "S A N"]) -> ActionChains:
+    """The chains of all actions."""
     entries = jnp.append(probability.ravel(), jnp.zeros((), probability.dtype))
     num_actions = edges.entry.shape[1]
     nothing = jnp.full((1, num_actions), probability.size, edges.entry.dtype)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import small_models
 
-from jaxhom.models.policy_chain import action_chains, find_edges, policy_chain, saves_gathers
+from jaxhom.models.edge_chains import action_chains, find_edges, policy_chain, saves_gathers
 
 # "absorbing": actions share edges; "sparse": over 16 predecessors in a row; "restart": wide rows of both kinds
 NAMES = ["absorbing", "sparse", "restart"]
@@ -56,7 +56,7 @@ def dense_products(transition, policies, values, flows):
 @pytest.mark.parametrize("name", NAMES)
 def test_edges(name):
     case = small_models.case(name)
-    edges, entries = case.mdp.edges, np.append(np.ravel(case.mdp.probability), 0.0)
+    edges, entries = case.mdp.dynamics.edges, np.append(np.ravel(case.mdp.probability), 0.0)
     source, target = np.nonzero((case.transition > 0).any(axis=1))
     np.testing.assert_array_equal(edges.source, source)
     np.testing.assert_array_equal(edges.target, target)
@@ -69,16 +69,16 @@ def test_edges(name):
 
 def test_the_cases_have_wide_rows():
     """What the other tests rely on."""
-    edges = small_models.case("restart").mdp.edges
+    edges = small_models.case("restart").mdp.dynamics.edges
     assert edges.outgoing.wide_row.size and edges.incoming.wide_row.size
-    assert small_models.case("sparse").mdp.edges.incoming.narrow.shape[1] > 16
+    assert small_models.case("sparse").mdp.dynamics.edges.incoming.narrow.shape[1] > 16
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_products(name):
     case = small_models.case(name)
     policies, values, flows = inputs(case)
-    found = products(case.mdp.edges, case.mdp.probability, policies, values, flows)
+    found = products(case.mdp.dynamics.edges, case.mdp.probability, policies, values, flows)
     for product, expected in dense_products(case.transition, policies, values, flows).items():
         np.testing.assert_allclose(found[product], expected, rtol=0, atol=1e-12, err_msg=product)
 
@@ -89,7 +89,9 @@ def test_products_follow_the_probabilities():
     policies, values, flows = inputs(case, 1)
     factor = np.random.default_rng(2).uniform(size=case.transition.shape)
     s, a, _ = np.indices(case.mdp.next_state.shape)
-    found = products(case.mdp.edges, case.mdp.probability * factor[s, a, case.mdp.next_state], policies, values, flows)
+    found = products(
+        case.mdp.dynamics.edges, case.mdp.probability * factor[s, a, case.mdp.next_state], policies, values, flows
+    )
     for product, expected in dense_products(case.transition * factor, policies, values, flows).items():
         np.testing.assert_allclose(found[product], expected, rtol=0, atol=1e-12, err_msg=product)
 
@@ -98,18 +100,18 @@ def test_derivatives():
     """u . P_pi v is linear in probability and policy: its derivatives are written down from the dense model."""
     case = small_models.case("restart")
     policies, values, flows = map(jnp.asarray, inputs(case))
-    on_pairs = np.random.default_rng(3).normal(size=(*case.shape, BATCH))
+    edges, on_pairs = case.mdp.dynamics.edges, np.random.default_rng(3).normal(size=(*case.shape, BATCH))
 
     @jax.jit
     def gradients(probability, policies):
         def backward(probability, policies):
-            return (flows * policy_chain(case.mdp.edges, probability, policies).expected_next_value(values)).sum()
+            return (flows * policy_chain(edges, probability, policies).expected_next_value(values)).sum()
 
         def forward(probability, policies):
-            return (values * policy_chain(case.mdp.edges, probability, policies).push_forward(flows)).sum()
+            return (values * policy_chain(edges, probability, policies).push_forward(flows)).sum()
 
         def actions(probability):
-            expected = action_chains(case.mdp.edges, probability).expected_next_values(values)
+            expected = action_chains(edges, probability).expected_next_values(values)
             return (on_pairs * jnp.stack(expected, axis=1)).sum()
 
         both = [jax.grad(product, argnums=(0, 1))(probability, policies) for product in (backward, forward)]

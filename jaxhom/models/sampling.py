@@ -1,0 +1,58 @@
+"""Walks of a policy through a model, drawn step by step: what `sample_demonstrations` runs."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+
+from jaxhom.models.mdp import MDP
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Bool, Float, Int, Key
+
+
+@functools.partial(jax.jit, static_argnums=(4, 5))
+def sample_walks(
+    key: Key[Array, ""],
+    mdp: MDP,
+    policy: Float[Array, "S A"],
+    terminal: Bool[Array, " S"] | None,
+    num_walks: int,
+    horizon: int,
+) -> dict[str, Array]:
+    """Walks of at most H steps from the initial distribution; a walk stays where it met a terminal state.
+
+    Returns:
+      Fields of `Demonstrations`: `states`, `actions` and `mask` [M, H], 0 where a walk has ended; where states are
+      terminal also `terminated` and `final_states` [M].
+    """
+    initial_key, steps_key = jax.random.split(key)
+    lanes = (num_walks,)
+    uniform = jax.random.uniform(initial_key, lanes, mdp.dtype)
+    first = jax.vmap(_inverse_cdf, in_axes=(None, 0))(jnp.cumsum(mdp.initial), uniform)
+    draw = jax.vmap(_inverse_cdf)
+    ends = jnp.zeros(mdp.num_states, bool) if terminal is None else terminal
+
+    def step(state, key):
+        draw_action, draw_successor = jax.random.uniform(key, (2, *lanes), mdp.dtype)
+        action = draw(jnp.cumsum(policy[state], axis=-1), draw_action)
+        slot = draw(jnp.cumsum(mdp.probability[state, action], axis=-1), draw_successor)
+        goes_on = ~ends[state]  # an episode that has ended stays where it is
+        return jnp.where(goes_on, mdp.next_state[state, action, slot], state), (state, action, goes_on)
+
+    last, (states, actions, mask) = jax.lax.scan(step, first, jax.random.split(steps_key, horizon))
+    steps = {"states": jnp.where(mask, states, 0).T, "actions": jnp.where(mask, actions, 0).T, "mask": mask.T}
+    return steps if terminal is None else {**steps, "terminated": ends[last], "final_states": last}
+
+
+def _inverse_cdf(cumulative: Float[Array, " N"], uniform: Float[Array, ""]) -> Int[Array, ""]:
+    """First index whose cumulative weight exceeds `uniform` in [0, 1) times the total.
+
+    Scaled by the total and strictly below it: an index of probability zero is never drawn, whatever the rounding.
+    """
+    total = cumulative[-1]
+    target = jnp.minimum(uniform * total, jnp.nextafter(total, jnp.zeros_like(total)))
+    return jnp.searchsorted(cumulative, target, side="right").astype(jnp.int32)

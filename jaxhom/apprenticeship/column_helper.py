@@ -1,4 +1,8 @@
-"""Another method for slow lanes of LPAL on columns, in a thread of its own while the other lanes go on with columns."""
+"""Another method for slow lanes of LPAL on columns, in a thread of its own while the other lanes go on with columns.
+
+The thread is for batches: in one of 16 lanes of `grid48` (bench/results/speed_lpal.csv) the other method has five, and
+its thread a third of the CPU time; one after the other, a core would stand idle for that long.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from typing import NamedTuple
 from jaxhom.apprenticeship.column_lane import Lane
 from jaxhom.apprenticeship.interior_point import Point
 
-_STEPS = 50  # of a lane at most
+_STEPS = 50  # of a lane at most: 5 to 40 are usual, and the lane goes on with columns afterwards
 
 
 class Help(NamedTuple):

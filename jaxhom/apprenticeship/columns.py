@@ -34,9 +34,9 @@ from jaxhom.planning.chain_solver import is_solved_by_lu
 from jaxhom.solvers.lane_queue import num_cores
 
 DEFAULT_COLUMNS = 500
-_LANES_AT_A_TIME = 4  # per core
+_LANES_AT_A_TIME = 4  # programs of them under way per core, so that later lanes find policies in the pool
 _NUMBERS_AT_A_TIME = 1024  # states times lanes of one program: small models are solved in wider batches
-_MAX_WIDTH = 32
+_MAX_WIDTH = 32  # a wider program waits longer for its slowest lane
 
 
 def solve_by_columns(request: Request, find_help: Callable[[], Help | None] | None = None) -> Found:

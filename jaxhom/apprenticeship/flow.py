@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from jaxtyping import Array, Float
 
 DEFAULT_ITERATIONS = 20_000
-_STEPS_PER_LOOK = 16  # of pdhg.STEPS_PER_CHECK iterations each
-_LOOKS_PER_CERTIFICATE = 8
-_FIRST_WEIGHT = 0.1
+_STEPS_PER_LOOK = 16  # of pdhg.STEPS_PER_CHECK iterations each: a look solves seven linear systems per lane
+_LOOKS_PER_CERTIFICATE = 8  # looks nearly always say the same
+_FIRST_WEIGHT = 0.1  # the primal weight to begin with; the engine moves it from there
 _WEIGHT_RANGE = (0.01, 3.0)  # times the ratio of the dual to the primal point's length
 # An action that loses more than this share of the largest reward is left out of a policy.
 _CLEAR_LOSSES = (float("inf"), 1e-2, 1e-4)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 DEFAULT_STEPS = 100
-_MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals
+_MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals: certificates are made of what is left
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,7 @@ from jaxhom.status import Record
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_GAP = 1e-5  # share of what a feature can do
+_GAP = 1e-5  # share of what a feature can do: a policy that loses so little is as good
 _SAME = 4.0  # roundings of a feature's size within which two of its values are the same
 
 

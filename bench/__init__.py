@@ -5,12 +5,17 @@ figures and words. The flow of a sweep, one module each:
 
     settings  which problems: domain, demonstrations, options; `problems` draws them, `methods` learns from them
     sweep     runs settings x methods in batches of draws, appends one row per draw (`rows`), resumes
-    summaries means over draws with confidence intervals (`intervals`)
+    summaries means over draws with confidence intervals
     report    reads rows only: `comparison` with the paper in words, `tables`, `figures`
 
-`python -m bench.speed similarity | lpal | planning` measures speed next to other solvers. For each kind, X_speed draws
-instances, asks this library and the peers, judges both by one certificate and prints rows (`speed_rows`); X_report
-makes a table and a figure of the rows; peers run in processes of their own with a time limit (`limits`).
+`python -m bench.speed similarity | lpal | planning` measures speed next to other solvers, from bottom to top:
+
+    processes        the protocol of whoever is measured, in a process with a time limit
+    ours             this library under that protocol; `lp_peers` and `planning_peers` the others, which get
+                     `linear_programs` and `models` in their own form
+    contest          rows of us and of the peers on one instance (`lpal_instances`, `planning_instances`)
+    X_speed          draws instances, judges whoever solved them by one certificate
+    X_report         makes a table and a figure of the rows alone
 """
 
 import os

@@ -1,8 +1,7 @@
 """Our numbers against the paper's, in words.
 
-The paper has one draw of the reward per row of Table I, and means over 1000 trials. A printed number can therefore
-differ from our mean over draws for three reasons, which are told apart: its 1000 trials (`Row.sampled_error` says how
-much they scatter), its one draw (our draws say how much they scatter), or another method.
+A printed number can differ from our mean over draws for three reasons, which are told apart: its 1000 trials (the noise
+of which our sampled rows tell), its one draw (our draws say how much they scatter), or another method.
 """
 
 import dataclasses
@@ -10,67 +9,21 @@ import itertools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import pandas as pd
 
-from bench.intervals import Interval, mean_interval
 from bench.rows import Row
-from bench.summaries import METRICS, grouped, paper_table1
-
-_TWO_SIDED = 1.96
-AGREES, ONE_DRAW, DIFFERS = "agrees", "one draw", "differs"
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """A cell of Table I: the ratio to the expert, ours and the paper's.
-
-    Attributes:
-      reward, ratio: means over draws. paper_reward, paper_ratio: printed, NaN if it is not.
-      verdict: "agrees" if the printed ratio lies in our interval, widened by the noise of 1000 trials; "one draw" if it
-        does not, but lies among 95% of our draws; "differs" otherwise. Empty without a printed number.
-    """
-
-    grid: int
-    regions: int
-    method: str
-    reward: Interval
-    ratio: Interval
-    paper_reward: float
-    paper_ratio: float
-    verdict: str
-
-
-def compare_table1(rows: Iterable[Row]) -> list[Cell]:
-    """The cells of Table I, in the order of the rows."""
-    paper = paper_table1()
-    cells = []
-    for (domain, regions, method), group in grouped(rows, lambda row: (row.domain, row.regions, row.method)):
-        grid = int(domain.removeprefix("grid"))
-        ratios = np.array([row.reward_per_step / row.expert_reward for row in group])
-        printed = paper.get((grid, regions, method), np.nan)
-        printed_ratio = printed / paper.get((grid, regions, "expert"), np.nan)
-        reward = mean_interval([row.reward_per_step for row in group])
-        ratio = mean_interval(ratios)
-        verdict = _verdict(printed_ratio, ratio, ratios, _gap_noise(group))
-        cells.append(Cell(grid, regions, method, reward, ratio, printed, printed_ratio, verdict))
-    return cells
-
-
-def _gap_noise(group: Sequence[Row]) -> float:
-    """What two means of 1000 trials leave open of their difference, at 95%, as a share of the expert's reward.
-
-    0 where no trials were run.
-    """
-    errors = [row.sampled_error / row.expert_reward for row in group if row.sampled_error is not None]
-    return _TWO_SIDED * float(np.sqrt(2) * np.mean(errors)) if errors else 0.0
-
-
-def _verdict(printed: float, ratio: Interval, ratios: np.ndarray, noise: float) -> str:
-    if not np.isfinite(printed) or ratio.count < 2:
-        return ""
-    if abs(printed - ratio.mean) <= np.hypot(ratio.half_width, noise):
-        return AGREES
-    low, high = np.quantile(ratios, (0.025, 0.975))
-    return ONE_DRAW if low - noise <= printed <= high + noise else DIFFERS
+from bench.summaries import (
+    AGREES,
+    DIFFERS,
+    METRICS,
+    ONE_DRAW,
+    Interval,
+    frame,
+    grouped,
+    mean_interval,
+    paper_table1,
+    trial_noise,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +33,7 @@ class Order:
     Attributes:
       better, worse: by the paper. printed: gap of the printed ratios.
       noise: what 1000 trials leave open of a gap, at 95%.
-      ours: interval of better - worse, paired by draw.
+      ours: interval of better - worse, paired by draw; below zero the order is not the paper's.
     """
 
     grid: int
@@ -91,82 +44,87 @@ class Order:
     noise: float
     ours: Interval
 
-    @property
-    def is_reproduced(self) -> bool:
-        return self.ours.mean > 0
-
-    @property
-    def is_reversed(self) -> bool:
-        """Whether our interval lies on the other side of zero."""
-        return self.ours.high < 0
-
 
 def compare_orders(rows: Iterable[Row]) -> list[Order]:
     """Every pair of methods in every row where the paper's gap exceeds our interval's half-width."""
     paper, orders = paper_table1(), []
-    for (domain, regions), group in grouped(rows, lambda row: (row.domain, row.regions)):
-        grid, noise = int(domain.removeprefix("grid")), _gap_noise(group)
-        ratios = {}
-        for row in group:
-            ratios.setdefault(row.method, {})[row.draw] = row.reward_per_step / row.expert_reward
-        for pair in itertools.combinations([name for name in ratios if (grid, regions, name) in paper], 2):
-            better, worse = sorted(pair, key=lambda name: -paper[grid, regions, name])
-            shared = sorted(ratios[better].keys() & ratios[worse].keys())
-            ours = mean_interval([ratios[better][draw] - ratios[worse][draw] for draw in shared])
-            gap = paper[grid, regions, better] - paper[grid, regions, worse]
-            gap /= paper[grid, regions, "expert"]
+    for (domain, regions), group in grouped(frame(rows), "domain", "regions"):
+        grid, noise = int(domain.removeprefix("grid")), trial_noise(group)
+        printed = {method: paper.get((grid, regions, method)) for method in group["method"].unique()}
+        ratios = group.pivot(index="draw", columns="method", values="ratio")
+        for pair in itertools.combinations([name for name in printed if printed[name] is not None], 2):
+            better, worse = sorted(pair, key=lambda name: -printed[name])
+            ours = mean_interval((ratios[better] - ratios[worse]).dropna())
+            gap = (printed[better] - printed[worse]) / paper[grid, regions, "expert"]
             if ours.count > 1 and gap > ours.half_width:
                 orders.append(Order(grid, regions, better, worse, gap, noise, ours))
     return orders
 
 
-def table1_words(cells: Sequence[Cell], orders: Sequence[Order]) -> list[str]:
-    """Paragraphs (Markdown) about Table I."""
-    judged = [cell for cell in cells if cell.verdict and cell.method != "expert"]
-    counts = {verdict: sum(cell.verdict == verdict for cell in judged) for verdict in (AGREES, ONE_DRAW, DIFFERS)}
+def table1_words(cells: pd.DataFrame, orders: Sequence[Order]) -> list[str]:
+    """Paragraphs (Markdown) about Table I, from `summaries.table1`."""
+    counts = cells[(cells["verdict"] != "") & (cells["method"] != "expert")]["verdict"].value_counts()
     paragraphs = [
-        f"Of {len(judged)} printed ratios to the expert, {counts[AGREES]} lie within our 95% interval, widened by the "
-        f"noise of the paper's 1000 trials; {counts[ONE_DRAW]} lie outside it but among 95% of our single draws, of "
-        f"which the paper has one per row (†); {counts[DIFFERS]} differ by more than that (*)."
+        f"Of {counts.sum()} printed ratios to the expert, {counts.get(AGREES, 0)} lie within our 95% interval, widened "
+        f"by the noise of the paper's 1000 trials; {counts.get(ONE_DRAW, 0)} lie outside it but among 95% of our "
+        f"single draws, of which the paper has one per row (†); {counts.get(DIFFERS, 0)} differ by more than that (*)."
     ]
-    paragraphs += [_cell_words(method, cells) for method in dict.fromkeys(cell.method for cell in cells)]
-    lost = [order for order in orders if not order.is_reproduced]
+    paragraphs += [_cell_words(method, cells[cells["method"] == method]) for method in cells["method"].unique()]
+    lost = [order for order in orders if order.ours.mean <= 0]
     clear = [order for order in lost if order.printed > order.noise]
     paragraphs.append(
         f"Order of the methods: in {len(orders)} pairs of methods within a row the paper's gap exceeds our interval; "
         f"{len(orders) - len(lost)} of them are in the same order here. Of the other {len(lost)}, "
         f"{len(lost) - len(clear)} have a printed gap that the noise of 1000 trials explains."
     )
-    return [text for text in paragraphs + _order_words(clear) if text]
+    for pair in dict.fromkeys((order.better, order.worse) for order in clear):
+        listed = "; ".join(
+            f"{_row_name(order)}: {100 * order.printed:+.1f}% printed, {_percent(*order.ours[1:])} here"
+            f"{'' if order.ours.high < 0 else ' (not separated)'}"
+            for order in clear
+            if (order.better, order.worse) == pair
+        )
+        paragraphs.append(f"Not reproduced: {pair[0]} above {pair[1]}. {listed}.")
+    return [text for text in paragraphs if text]
 
 
-def _cell_words(method: str, cells: Sequence[Cell]) -> str:
+def _cell_words(method: str, cells: pd.DataFrame) -> str:
     """What to say of the cells of one method that differ by more than the interval; empty if none does."""
     meanings = {DIFFERS: "by more than draws and trials explain", ONE_DRAW: "but a single draw may differ as much"}
     parts = []
     for verdict, meaning in meanings.items():
         listed = "; ".join(
-            f"{cell.grid}x{cell.grid} with {cell.regions} regions: {100 * cell.paper_ratio:.1f}% printed, "
-            f"{_percent(cell.ratio)} here"
-            for cell in cells
-            if (cell.method, cell.verdict) == (method, verdict)
+            f"{_row_name(cell)}: {100 * cell.paper_ratio:.1f}% printed, "
+            f"{_percent(cell.ratio, cell.ratio_ci_low, cell.ratio_ci_high)} here"
+            for cell in cells[cells["verdict"] == verdict].itertuples()
         )
         parts += [f"{meaning}: {listed}."] if listed else []
     return f"**{method}** differs from the paper, " + " It differs, ".join(parts) if parts else ""
 
 
-def _order_words(lost: Sequence[Order]) -> list[str]:
-    """One sentence for every two methods whose order is not the paper's in some row."""
-    paragraphs = []
-    for pair in dict.fromkeys((order.better, order.worse) for order in lost):
-        rows = [order for order in lost if (order.better, order.worse) == pair]
-        listed = "; ".join(
-            f"{order.grid}x{order.grid} with {order.regions} regions: {100 * order.printed:+.1f}% printed, "
-            f"{_percent(order.ours)} here{'' if order.is_reversed else ' (not separated)'}"
-            for order in rows
-        )
-        paragraphs.append(f"Not reproduced: {pair[0]} above {pair[1]}. {listed}.")
-    return paragraphs
+def _row_name(cell) -> str:
+    return f"{cell.grid}x{cell.grid} with {cell.regions} regions"
+
+
+def _percent(mean: float, low: float, high: float) -> str:
+    return f"{100 * mean:.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+_SOFT, _LPAL_SOFT = "soft_local_homomorphism", "lpal_soft_local_homomorphism"
+_BOTH = ("track_a", "track_b")
+_PRINTED_ORDERS = [(_SOFT, "manhattan_knn", metric, _BOTH) for metric in METRICS] + [
+    ("lpal_full_policy", _LPAL_SOFT, "reward_per_step", _BOTH),
+    ("lpal_full_policy", "lpal_manhattan_knn", "reward_per_step", _BOTH),
+    (_SOFT, _LPAL_SOFT, "reward_per_step", ("track_b",)),
+    ("manhattan_knn", "lpal_manhattan_knn", "reward_per_step", ("track_b",)),
+]
+"""What section VI.B says of its Figure 1, whose numbers are not printed."""
+_OUR_ORDERS = [
+    (_SOFT, f"{_SOFT}_{relation}", metric, _BOTH)
+    for relation in ("printed", "mutual")
+    for metric in ("reward_per_step", "off_roads")
+]
+_METRIC_NAMES = {"reward_per_step": "reward per step", "steps": "steps", "off_roads": "off-roads per step"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,51 +149,27 @@ class CurveOrder:
     points: int
 
 
-_SOFT, _LPAL_SOFT = "soft_local_homomorphism", "lpal_soft_local_homomorphism"
-_PRINTED_ORDERS = [(_SOFT, "manhattan_knn", metric, ("track_a", "track_b")) for metric in METRICS] + [
-    ("lpal_full_policy", _LPAL_SOFT, "reward_per_step", ("track_a", "track_b")),
-    ("lpal_full_policy", "lpal_manhattan_knn", "reward_per_step", ("track_a", "track_b")),
-    (_SOFT, _LPAL_SOFT, "reward_per_step", ("track_b",)),
-    ("manhattan_knn", "lpal_manhattan_knn", "reward_per_step", ("track_b",)),
-]
-"""What section VI.B says of its Figure 1, whose numbers are not printed."""
-_OUR_ORDERS = [
-    (_SOFT, f"{_SOFT}_{relation}", metric, ("track_a", "track_b"))
-    for relation in ("printed", "mutual")
-    for metric in ("reward_per_step", "off_roads")
-]
-_METRIC_NAMES = {"reward_per_step": "reward per step", "steps": "steps", "off_roads": "off-roads per step"}
-
-
 def compare_curves(rows: Iterable[Row]) -> list[CurveOrder]:
     """The orders that the paper claims for Figure 1, then those between the relations."""
-    values = {}  # (track, method, metric) -> {(demonstrations, draw): value}
-    for row in rows:
-        for metric in METRICS if not row.error else ():
-            curve = values.setdefault((row.domain, row.method, metric), {})
-            curve[row.demonstrations, row.draw] = getattr(row, metric)
-    orders = []
-    for better, worse, metric, tracks in _PRINTED_ORDERS + _OUR_ORDERS:
-        is_printed = (better, worse, metric, tracks) in _PRINTED_ORDERS
-        for track in tracks:
-            one, other = (values.get((track, method, metric), {}) for method in (better, worse))
-            sign = 1.0 if metric == "reward_per_step" else -1.0
-            gaps = {key: sign * (one[key] - other[key]) for key in one.keys() & other.keys()}
-            if gaps:
-                orders.append(CurveOrder(track, metric, better, worse, is_printed, *_over_points(gaps)))
+    tracks, orders = dict(list(frame(rows).groupby("domain"))), []
+    for number, (better, worse, metric, names) in enumerate(_PRINTED_ORDERS + _OUR_ORDERS):
+        for track in filter(tracks.__contains__, names):
+            gaps = _gaps(tracks[track], metric, better, worse) * (1.0 if metric == "reward_per_step" else -1.0)
+            if gaps.empty:
+                continue
+            intervals = [mean_interval(point.dropna()) for _, point in gaps.iterrows()]
+            counts = sum(i.low > 0 for i in intervals), sum(i.high < 0 for i in intervals), len(intervals)
+            ours = mean_interval(gaps.dropna(axis=1).mean())
+            is_printed = number < len(_PRINTED_ORDERS)
+            orders.append(CurveOrder(track, metric, better, worse, is_printed, ours, *counts))
     return orders
 
 
-def _over_points(gaps: dict[tuple[int, int], float]) -> tuple[Interval, int, int, int]:
-    """Interval of the mean over points, points clearly above zero, below zero, all; from (point, draw) -> gap."""
-    points, draws = ({}, {})
-    for (point, draw), gap in sorted(gaps.items()):
-        points.setdefault(point, []).append(gap)
-        draws.setdefault(draw, []).append(gap)
-    whole = [np.mean(found) for found in draws.values() if len(found) == len(points)]
-    intervals = [mean_interval(found) for found in points.values()]
-    above, below = sum(i.low > 0 for i in intervals), sum(i.high < 0 for i in intervals)
-    return mean_interval(whole), above, below, len(points)
+def _gaps(rows: pd.DataFrame, metric: str, one: str, other: str) -> pd.DataFrame:
+    """one - other, numbers of demonstrations by rows, draws by columns."""
+    values = rows.pivot(index=["demonstrations", "draw"], columns="method", values=metric)
+    values = values.reindex(columns=[one, other])
+    return (values[one] - values[other]).dropna().unstack()
 
 
 def figure1_words(orders: Sequence[CurveOrder]) -> list[str]:
@@ -244,12 +178,10 @@ def figure1_words(orders: Sequence[CurveOrder]) -> list[str]:
     for order in orders:
         sign = 1.0 if order.metric == "reward_per_step" else -1.0
         gap = f"{sign * order.ours.mean:+.3g} ± {order.ours.half_width:.2g}"
-        verdict = ""
-        if order.is_printed:
-            verdict = "open: " if order.ours.low <= 0 <= order.ours.high else "reproduced: "
-            verdict = "**not reproduced**: " if order.ours.high < 0 else verdict
+        verdict = "" if not order.is_printed else "reproduced: " if order.ours.low > 0 else "open: "
+        verdict = "**not reproduced**: " if order.is_printed and order.ours.high < 0 else verdict
         sentences.append(
-            f"{_track_name(order.track)}, {verdict}{order.better} better than {order.worse} in "
+            f"Racetrack ({order.track.removeprefix('track_')}), {verdict}{order.better} better than {order.worse} in "
             f"{_METRIC_NAMES[order.metric]}: {gap} on average over {order.points} points, clear at {order.clear}, "
             f"the other way round at {order.reversed}."
         )
@@ -258,18 +190,7 @@ def figure1_words(orders: Sequence[CurveOrder]) -> list[str]:
 
 def largest_difference(rows: Iterable[Row], track: str, one: str, other: str) -> float:
     """The largest difference of any metric, draw and number of demonstrations between two methods on a track."""
-    values = {}
-    for row in rows:
-        if row.domain == track and not row.error and row.method in (one, other):
-            values.setdefault((row.demonstrations, row.draw), {})[row.method] = row
-    pairs = [pair for pair in values.values() if len(pair) == 2]
-    gaps = [abs(getattr(p[one], metric) - getattr(p[other], metric)) for p in pairs for metric in METRICS]
-    return max(gaps, default=np.nan)
-
-
-def _track_name(domain: str) -> str:
-    return f"Racetrack ({domain.removeprefix('track_')})"
-
-
-def _percent(interval: Interval) -> str:
-    return f"{100 * interval.mean:.1f}% [{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
+    found = frame(rows)
+    found = found[found["domain"] == track]
+    gaps = [_gaps(found, metric, one, other).abs().to_numpy() for metric in METRICS]
+    return float(np.nanmax(np.concatenate(gaps))) if all(gap.size for gap in gaps) else np.nan

@@ -4,10 +4,9 @@ Colours are those of Okabe and Ito (2008), and every curve has a marker and a li
 (numbers of samples) run through cividis.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -41,99 +40,80 @@ _METRICS = {
 _DOMAINS = {"track_a": "racetrack (a)", "track_b": "racetrack (b)", "track_corner": "corner track"}
 
 
-def figure1(lines: Sequence[dict]) -> Figure:
+def figure1(lines: pd.DataFrame) -> Figure:
     """Six panels: a row per track; reward, steps and off-roads against the number of demonstrations."""
-    tracks = list(dict.fromkeys(line["track"] for line in lines))
-    metrics = [metric for metric in _METRICS if any(line["metric"] == metric for line in lines)]
-    figure, panels = plt.subplots(
-        len(tracks), len(metrics), figsize=(12.5, 3.6 * len(tracks) + 0.9), squeeze=False, layout="constrained"
-    )
+    tracks, metrics = lines["track"].unique(), [name for name in _METRICS if name in set(lines["metric"])]
+    figure, panels = _panels(len(tracks), len(metrics), (12.5, 3.6 * len(tracks) + 0.9))
     names = iter("abcdefghij")
-    for track, row in zip(tracks, panels, strict=True):
-        for metric, ax in zip(metrics, row, strict=True):
-            here = [line for line in lines if (line["track"], line["metric"]) == (track, metric)]
-            _draw_methods(ax, here, "demonstrations")
-            ax.set(xlabel="demonstrations", ylabel=_METRICS[metric])
-            ax.set_title(f"({next(names)}) racetrack ({track})", loc="left", fontsize="medium")
-            ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    _legend_below(figure, panels.flat, columns=3)
-    return figure
+    for (track, metric), ax in zip(((t, m) for t in tracks for m in metrics), panels.flat, strict=True):
+        _draw_methods(ax, _pick(lines, track=track, metric=metric), "demonstrations", metric)
+        ax.set_title(f"({next(names)}) racetrack ({track})", loc="left", fontsize="medium")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return _with_legend(figure, columns=3)
 
 
-def threshold_figure(lines: Sequence[dict]) -> Figure:
+def threshold_figure(lines: pd.DataFrame) -> Figure:
     """Off-roads and reward against epsilon, a column per track and distance."""
-    columns = _ordered((line["domain"], line["distance"]) for line in lines)
-    metrics = ("off_roads", "reward_per_step")
-    figure, panels = _grid_of_panels(metrics, columns)
+    columns = list(dict.fromkeys(zip(lines["domain"], lines["distance"], strict=True)))
+    figure, panels = _panels(2, len(columns), (4.2 * len(columns), 6.5), sharex="col")
     for (domain, distance), column in zip(columns, panels.T, strict=True):
-        for metric, ax in zip(metrics, column, strict=True):
-            here = _pick(lines, metric=metric, domain=domain, distance=distance)
-            _draw_methods(ax, here, "threshold")
-            ax.set(xlabel=r"threshold $\epsilon$", ylabel=_METRICS[metric])
+        for metric, ax in zip(("off_roads", "reward_per_step"), column, strict=True):
+            _draw_methods(ax, _pick(lines, metric=metric, domain=domain, distance=distance), "threshold", metric)
         column[0].set_title(f"{_DOMAINS[domain]}, d = {distance}", loc="left", fontsize="medium")
-    _legend_below(figure, panels.flat, columns=4)
-    return figure
+    return _with_legend(figure, columns=4)
 
 
-def noise_figure(lines: Sequence[dict]) -> Figure:
+def noise_figure(lines: pd.DataFrame) -> Figure:
     """Off-roads and reward against epsilon, a curve per number of samples of each transition."""
-    metrics = ("off_roads", "ratio")
-    figure, panels = _grid_of_panels(metrics, [None], width=6.5)
-    soft = [line for line in lines if line["method"] == "soft_local_homomorphism"]
-    samples = sorted({line["samples"] for line in soft}, key=lambda count: count or np.inf)
+    figure, panels = _panels(2, 1, (6.5, 6.5), sharex="col")
+    soft = _pick(lines, method="soft_local_homomorphism")
+    samples = sorted(soft["samples"].unique(), key=lambda count: count or np.inf)
     colors = plt.get_cmap("cividis")(np.linspace(0.0, 0.85, len(samples)))
-    for metric, ax in zip(metrics, panels[:, 0], strict=True):
+    for metric, ax in zip(("off_roads", "ratio"), panels.flat, strict=True):
         for count, color, marker in zip(samples, colors, "osD^vPX", strict=False):
-            here = _pick(soft, metric=metric, samples=count)
             label = f"{count} samples" if count else "true model"
-            _draw_curve(ax, here, "threshold", label, color, marker, "-")
+            _draw_curve(ax, _pick(soft, metric=metric, samples=count), "threshold", label, color, marker, "-")
         here = _pick(lines, metric=metric, samples=0, method="manhattan_knn")
         _draw_curve(ax, here, "threshold", "k-NN, true model", VERMILLION, "", "--")
-        ax.set(xlabel=r"threshold $\epsilon$", ylabel=_METRICS[metric])
-    _legend_below(figure, panels.flat, columns=3)
-    return figure
+        _finish(ax, "threshold", metric)
+    return _with_legend(figure, columns=3)
 
 
-def enough_figure(lines: Sequence[dict]) -> Figure:
+def enough_figure(lines: pd.DataFrame) -> Figure:
     """Reward as a share of the expert's against the number of demonstrations, a panel per domain."""
-    domains = _ordered(line["domain"] for line in lines)
+    domains = lines["domain"].unique()
     columns = min(3, len(domains))
     height = -(-len(domains) // columns)
-    figure, panels = plt.subplots(
-        height, columns, figsize=(4.2 * columns, 3.3 * height + 0.7), squeeze=False, layout="constrained"
-    )
+    figure, panels = _panels(height, columns, (4.2 * columns, 3.3 * height + 0.7))
     for ax in panels.flat[len(domains) :]:
         ax.set_visible(False)
     for domain, ax in zip(domains, panels.flat, strict=False):
-        _draw_methods(ax, _pick(lines, metric="ratio", domain=domain), "demonstrations", without=("expert",))
+        here = _pick(lines, metric="ratio", domain=domain)
+        _draw_methods(ax, here[here["method"] != "expert"], "demonstrations", "ratio")
         ax.axhline(0.99, color=BLACK, linewidth=0.8, linestyle=(0, (1, 1)))
-        ax.set(xscale="log", xlabel="demonstrations", ylabel=_METRICS["ratio"], ylim=(None, 1.02))
+        ax.set(xscale="log", ylim=(None, 1.02))
         ax.set_title(domain_name(domain), loc="left", fontsize="medium")
-    _legend_below(figure, panels.flat, columns=4)
-    return figure
+    return _with_legend(figure, columns=4)
 
 
-def normalisation_figure(lines: Sequence[dict]) -> Figure:
+def normalisation_figure(lines: pd.DataFrame) -> Figure:
     """Monte Carlo's reward in the rows of Table I, by two normalisations of its expectations, and as printed."""
-    rows = _ordered((line["domain"], line["regions"]) for line in lines)
-    figure, ax = plt.subplots(figsize=(8.0, 3.8), layout="constrained")
+    rows = list(dict.fromkeys(zip(lines["domain"], lines["regions"], strict=True)))
+    figure, panels = _panels(1, 1, (8.0, 3.8))
+    ax = panels[0, 0]
     for shift, method in ((-0.12, "monte_carlo"), (0.12, "monte_carlo_per_step")):
         label, color, marker, _ = STYLES[method]
-        here = [_pick(lines, metric="reward_per_step", method=method, domain=d, regions=k) for d, k in rows]
-        at = [place + shift for place, found in enumerate(here) if found]
-        found = [found[0] for found in here if found]
-        mean = np.array([line["mean"] for line in found])
-        half = [0.5 * (line["ci_high"] - line["ci_low"]) for line in found]
-        ax.errorbar(at, mean, half, color=color, marker=marker, linestyle="none", label=label, capsize=3)
+        here = _pick(lines, metric="reward_per_step", method=method)
+        at = [rows.index(row) + shift for row in zip(here["domain"], here["regions"], strict=True)]
+        half, style = 0.5 * (here["ci_high"] - here["ci_low"]), {"color": color, "marker": marker, "label": label}
+        ax.errorbar(at, here["mean"], half, linestyle="none", capsize=3, **style)
     printed = [paper_table1().get((int(domain[4:]), regions, "monte_carlo")) for domain, regions in rows]
     ax.plot(range(len(rows)), printed, color=BLACK, marker="_", markersize=14, linestyle="none", label="printed")
     names = [f"{domain[4:]} x {domain[4:]}\n{regions}" for domain, regions in rows]
-    ax.set(xticks=range(len(rows)), xticklabels=names, xlabel="grid and regions", ylabel=_METRICS["reward_per_step"])
+    _finish(ax, "grid and regions", "reward_per_step", axis="y")
+    ax.set(xticks=range(len(rows)), xticklabels=names)
     ax.set_ylim(bottom=0.0)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.grid(color="#DDDDDD", linewidth=0.6, axis="y")
-    _legend_below(figure, [ax], columns=3)
-    return figure
+    return _with_legend(figure, columns=3)
 
 
 def domain_name(domain: str) -> str:
@@ -142,45 +122,45 @@ def domain_name(domain: str) -> str:
     return _DOMAINS.get(domain, f"gridworld {size} x {size}")
 
 
-def _draw_methods(ax: Axes, lines: Sequence[dict], x: str, without: Sequence[str] = ()) -> None:
+def _draw_methods(ax: Axes, lines: pd.DataFrame, x: str, metric: str) -> None:
     """A curve per method, in the order of `STYLES`."""
-    for method, (label, color, marker, style) in STYLES.items():
-        here = [line for line in lines if line["method"] == method]
-        if here and method not in without:
-            _draw_curve(ax, here, x, label, color, marker, style)
+    for method, style in STYLES.items():
+        here = _pick(lines, method=method)
+        if len(here):
+            _draw_curve(ax, here, x, *style)
+    _finish(ax, x, metric)
 
 
-def _draw_curve(ax: Axes, lines: Sequence[dict], x: str, label: str, color, marker: str, style: str) -> None:
+def _draw_curve(ax: Axes, lines: pd.DataFrame, x: str, label: str, color, marker: str, style: str) -> None:
     """One curve with its band."""
-    lines = sorted(lines, key=lambda line: line[x])
-    at, mean, low, high = ([line[name] for line in lines] for name in (x, "mean", "ci_low", "ci_high"))
+    lines = lines.sort_values(x)
     # Hollow and larger: where the program as printed becomes k-NN, both curves are to be seen.
     hollow = {"markerfacecolor": "none", "markersize": 8, "zorder": 3} if marker == "D" else {"markersize": 4.5}
-    ax.plot(at, mean, color=color, marker=marker, linestyle=style, label=label, linewidth=1.4, **hollow)
-    ax.fill_between(at, low, high, color=color, alpha=0.15, linewidth=0)
+    options = {"color": color, "marker": marker, "linestyle": style, "linewidth": 1.4, "label": label}
+    ax.plot(lines[x], lines["mean"], **options, **hollow)
+    ax.fill_between(lines[x], lines["ci_low"], lines["ci_high"], color=color, alpha=0.15, linewidth=0)
+
+
+def _finish(ax: Axes, x: str, metric: str, axis: str = "both") -> None:
+    """Names of the axes, and a grid."""
+    ax.set(xlabel=r"threshold $\epsilon$" if x == "threshold" else x, ylabel=_METRICS[metric])
     ax.spines[["top", "right"]].set_visible(False)
-    ax.grid(color="#DDDDDD", linewidth=0.6)
+    ax.grid(color="#DDDDDD", linewidth=0.6, axis=axis)
 
 
-def _grid_of_panels(metrics: Sequence[str], columns: Sequence, width: float = 4.2):
-    size = (width * len(columns), 2.9 * len(metrics) + 0.7)
-    return plt.subplots(len(metrics), len(columns), figsize=size, squeeze=False, layout="constrained", sharex="col")
+def _panels(rows: int, columns: int, size: tuple[float, float], **options) -> tuple[Figure, np.ndarray]:
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **options)
 
 
-def _legend_below(figure: Figure, panels: Iterable[Axes], columns: int) -> None:
-    """One legend for all panels."""
+def _with_legend(figure: Figure, columns: int) -> Figure:
+    """One legend for all panels, below."""
     handles = {}
-    for ax in panels:
+    for ax in figure.axes:
         handles |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, frameon=False)
+    return figure
 
 
-def _pick(lines: Sequence[dict], **wanted) -> list[dict]:
+def _pick(lines: pd.DataFrame, **wanted) -> pd.DataFrame:
     """The lines with the given values."""
-    return [line for line in lines if all(line[name] == value for name, value in wanted.items())]
-
-
-def _ordered(values: Iterable, key: Callable | None = None) -> list:
-    """Different values, in the order of their first occurrence or sorted by `key`."""
-    values = list(dict.fromkeys(values))
-    return values if key is None else sorted(values, key=key)
+    return lines[np.logical_and.reduce([lines[name] == value for name, value in wanted.items()])]

@@ -15,11 +15,12 @@ import numpy as np
 
 import jaxhom
 
-DISCOUNT = 0.99
+DISCOUNT = 0.99  # the paper's
+NUM_ACTIONS = 4  # of Garnets
 _PERTURBATION = 0.2
 _BUMPS_PER_SIDE = 8
-_DEMONSTRATIONS = 10
-_LANES_AT_ONCE = 8  # of experts that are planned for together
+_DEMONSTRATIONS = 10  # the paper's
+_LANES_AT_ONCE = 8  # of experts that are planned for together, which bounds the memory on the largest grid
 _TRACK_WEIGHTS = np.array([5.0, 200.0])  # on the road, at the finish (Boularias and Chaib-draa 2010, section VI.B)
 
 
@@ -38,33 +39,29 @@ class Instance:
     title: str
     build: Callable[[], jaxhom.MDP]
     weights: Callable[[int, int, int], np.ndarray]
-    expectations: str
+    expectations: str = "perturbed"
     horizon: int = 0
 
     def draw(self, seed: int, lanes: int) -> tuple[jaxhom.MDP, np.ndarray]:
         """The model, and expectations [B, K] of `lanes` experts."""
-        mdp = self.build()
-        weights = np.stack([self.weights(seed, lane, mdp.num_features) for lane in range(lanes)])
-        parts = [range(first, min(first + _LANES_AT_ONCE, lanes)) for first in range(0, lanes, _LANES_AT_ONCE)]
-        return mdp, np.concatenate([self._expectations(mdp, weights[part], seed, part) for part in parts])
+        mdp, parts = self.build(), np.split(np.arange(lanes), range(_LANES_AT_ONCE, lanes, _LANES_AT_ONCE))
+        return mdp, np.concatenate([self._expectations(mdp, seed, part.tolist()) for part in parts])
 
-    def _expectations(self, mdp, weights, seed: int, lanes: range) -> np.ndarray:
+    def _expectations(self, mdp: jaxhom.MDP, seed: int, lanes: list[int]) -> np.ndarray:
+        weights = np.stack([self.weights(seed, lane, mdp.num_features) for lane in lanes])
         policies = jaxhom.optimal_policy(mdp, jnp.einsum("sak,bk->bsa", mdp.features, weights)).policy
         if self.expectations == "monte_carlo":
-            keys = [jax.random.fold_in(jax.random.key(seed), lane) for lane in lanes]
-            found = [_monte_carlo(mdp, *pair, self.horizon) for pair in zip(keys, policies, strict=True)]
-            return np.stack(found)
+            return np.stack([self._monte_carlo(mdp, seed, *pair) for pair in zip(lanes, policies, strict=True)])
         found = np.asarray(jaxhom.feature_expectations(mdp, policies))
         if self.expectations == "exact":
             return found
-        low, high = 1.0 - _PERTURBATION, 1.0 + _PERTURBATION
-        draws = [np.random.default_rng([seed, lane, 1]).uniform(low, high, mdp.num_features) for lane in lanes]
-        return found * np.stack(draws)
+        bounds = 1.0 - _PERTURBATION, 1.0 + _PERTURBATION, mdp.num_features
+        return found * np.stack([np.random.default_rng([seed, lane, 1]).uniform(*bounds) for lane in lanes])
 
-
-def _monte_carlo(mdp, key, policy, horizon: int) -> np.ndarray:
-    demonstrations = jaxhom.sample_demonstrations(key, mdp, policy, _DEMONSTRATIONS, horizon)
-    return np.asarray(jaxhom.monte_carlo_feature_expectations(mdp, demonstrations))
+    def _monte_carlo(self, mdp: jaxhom.MDP, seed: int, lane: int, policy) -> np.ndarray:
+        key = jax.random.fold_in(jax.random.key(seed), lane)
+        shown = jaxhom.sample_demonstrations(key, mdp, policy, _DEMONSTRATIONS, self.horizon)
+        return np.asarray(jaxhom.monte_carlo_feature_expectations(mdp, shown))
 
 
 # ------------------------------------------------------------------------------------------------------------- models
@@ -96,33 +93,33 @@ def bumps(size: int) -> jaxhom.MDP:
     return world.mdp.replace(features=jnp.repeat(features[:, None], world.mdp.num_actions, axis=1))
 
 
-def dense_garnet(num_states: int = 500, num_actions: int = 4, num_features: int = 32, seed: int = 0) -> jaxhom.MDP:
+def track(name: str) -> jaxhom.MDP:
+    """A racetrack."""
+    return jaxhom.racetrack(name, discount=DISCOUNT, dtype=np.float64).mdp
+
+
+def dense_garnet(num_states: int = 500, num_features: int = 32) -> jaxhom.MDP:
     """Every state follows every pair, rows uniform on the simplex; features uniform on [0, 1]."""
-    rng = np.random.default_rng([seed, num_states])
-    transition = rng.dirichlet(np.ones(num_states), (num_states, num_actions))
-    features = rng.random((num_states, num_actions, num_features))
+    rng = np.random.default_rng([0, num_states])
+    transition = rng.dirichlet(np.ones(num_states), (num_states, NUM_ACTIONS))
+    features = rng.random((num_states, NUM_ACTIONS, num_features))
     return jaxhom.MDP.from_dense(transition, discount=DISCOUNT, features=features)
 
 
-def sparse_garnet(num_states: int, num_actions: int = 4, successors: int = 5, seed: int = 0) -> jaxhom.MDP:
+def sparse_garnet(num_states: int, successors: int = 5) -> jaxhom.MDP:
     """Random successors for every pair, their probabilities uniform on the simplex; no features."""
-    rng = np.random.default_rng([seed, num_states, successors])
-    next_state = rng.integers(num_states, size=(num_states, num_actions, successors))
-    probability = rng.dirichlet(np.ones(successors), (num_states, num_actions))
+    rng = np.random.default_rng([0, num_states, successors])
+    next_state = rng.integers(num_states, size=(num_states, NUM_ACTIONS, successors))
+    probability = rng.dirichlet(np.ones(successors), (num_states, NUM_ACTIONS))
     return jaxhom.MDP.from_successors(next_state, probability, discount=DISCOUNT)
 
 
 # ------------------------------------------------------------------------------------------------------------ experts
 
 
-def _region_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
+def region_weights(seed: int, lane: int, num_regions: int) -> np.ndarray:
     """The paper's draw: one weight in ten is not 0."""
-    key = jax.random.fold_in(jax.random.key(seed), lane)
-    return np.asarray(jaxhom.sample_weights(key, num_features))
-
-
-def _positive_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
-    return np.random.default_rng([seed, lane]).random(num_features)
+    return np.asarray(jaxhom.sample_weights(jax.random.fold_in(jax.random.key(seed), lane), num_regions), float)
 
 
 def track_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
@@ -130,36 +127,37 @@ def track_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
     return _TRACK_WEIGHTS * np.random.default_rng([seed, lane]).uniform(0.5, 1.5, num_features)
 
 
-def _regions(size: int, num_regions: int, expectations: str, horizon: int = 0) -> Instance:
+def _positive_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
+    return np.random.default_rng([seed, lane]).random(num_features)
+
+
+def _regions(size: int, num_regions: int, expectations: str = "perturbed", horizon: int = 0) -> Instance:
     title = f"{size}x{size}, {num_regions} regions, {expectations.replace('_', ' ')}"
-    return Instance(title, lambda: regions(size, num_regions), _region_weights, expectations, horizon)
+    return Instance(title, lambda: regions(size, num_regions), region_weights, expectations, horizon)
 
 
 def _bumps(size: int) -> Instance:
-    return Instance(f"{size}x{size}, 64 bumps, perturbed", lambda: bumps(size), _positive_weights, "perturbed")
+    return Instance(f"{size}x{size}, 64 bumps, perturbed", lambda: bumps(size), _positive_weights)
 
 
 def _track(name: str) -> Instance:
-    def build():
-        return jaxhom.racetrack(name, discount=DISCOUNT, dtype=np.float64).mdp
-
-    return Instance(f"racetrack {name}, Monte Carlo", build, track_weights, "monte_carlo", 30)
+    return Instance(f"racetrack {name}, Monte Carlo", lambda: track(name), track_weights, "monte_carlo", 30)
 
 
 INSTANCES = {
-    "grid16": _regions(16, 64, "perturbed"),
+    "grid16": _regions(16, 64),
     "grid16_exact": _regions(16, 64, "exact"),
     "grid16_monte_carlo": _regions(16, 64, "monte_carlo", 50),
-    "grid24": _regions(24, 64, "perturbed"),
+    "grid24": _regions(24, 64),
     "bumps24": _bumps(24),
-    "grid32": _regions(32, 64, "perturbed"),
-    "grid48": _regions(48, 64, "perturbed"),
+    "grid32": _regions(32, 64),
+    "grid48": _regions(48, 64),
     "grid48_exact": _regions(48, 64, "exact"),
     "grid48_monte_carlo": _regions(48, 64, "monte_carlo", 200),
     "bumps48": _bumps(48),
-    "grid100": _regions(100, 100, "perturbed"),
-    "grid316": _regions(316, 100, "perturbed"),
-    "garnet": Instance("dense Garnet, S = 500, K = 32", dense_garnet, _positive_weights, "perturbed"),
+    "grid100": _regions(100, 100),
+    "grid316": _regions(316, 100),
+    "garnet": Instance("dense Garnet, S = 500, K = 32", dense_garnet, _positive_weights),
     "racetrack_a": _track("a"),
     "racetrack_b": _track("b"),
 }

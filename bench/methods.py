@@ -9,19 +9,18 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxhom.similarity.homomorphism import ClassSimilarity
 
 import jaxhom
 from bench.problems import Problem, build_domain
 from bench.settings import Setting
-from jaxhom import MDP, Status
-from jaxhom.similarity.local_models import LocalModelClasses, local_model_classes
+from jaxhom import MDP, SimilarityTable
 
-_SIMILARITY_TOLERANCE = 1e-4
-_MONTE_CARLO_SHARE = 1e-3  # LPAL's gap as a share of what each of K regions gets of evenly spread time
-_MANY_FEATURES = 8  # from here on Monte Carlo's LPAL takes the interior-point method
+_SIMILARITY_TOLERANCE = 1e-4  # the library's default, which decisions shared by draws have to repeat
+_MONTE_CARLO_SHARE = 1e-3  # LPAL's gap as a share of what each of K regions gets of evenly spread time: no digit shown
+_MANY_FEATURES = 8  # grids have 16 and more, for which columns take long; racetracks two
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,23 +40,6 @@ def expert(problem: Problem) -> Learned:
     return Learned(problem.expert.policy)
 
 
-class Decisions(ClassSimilarity):
-    """Decisions of Algorithm 1, which also keep how they ended.
-
-    Attributes:
-      status: the worst of all pairs of classes. excess: by how much the error of an accepted pair may exceed epsilon.
-    """
-
-    status, excess = Status.SOLVED, 0.0
-
-    def solve(self, pairs, *, progress=False):
-        found = super().solve(pairs, progress=progress)
-        accepted = found.upper[found.upper <= self.threshold + self.tolerance]
-        self.status = max(self.status, int(found.status.max(initial=Status.SOLVED)))
-        self.excess = max(self.excess, float((accepted - self.threshold).max(initial=0.0)))
-        return found
-
-
 def soft(problem: Problem, *, anchored: bool = True, mutual: bool = False) -> Learned:
     """Algorithm 1, with the setting's distance and threshold."""
     setting = problem.setting
@@ -65,34 +47,31 @@ def soft(problem: Problem, *, anchored: bool = True, mutual: bool = False) -> Le
     options |= {"anchored": anchored, "mutual": mutual}
     if problem.domain.terminal is not None:
         options["states"] = ~problem.domain.terminal  # the finish line puts the car back, whatever the action
-    policies, decided = [], []
+    found, excess = [], []
     for model, demonstrations in zip(problem.models, problem.demonstrations, strict=True):
-        decisions = _decisions(setting, model, anchored)
-        found = jaxhom.soft_local_homomorphism(model, demonstrations, similarity=decisions, **options)
-        policies.append(found.policy)
-        decided.append((decisions.status, decisions.excess))
-    status, excess = np.array(decided).T
-    return Learned(jnp.stack(policies), status, excess)
+        table = _table(setting, model, anchored)
+        found.append(jaxhom.soft_local_homomorphism(model, demonstrations, table=table, **options))
+        excess.append(excess_of(table, setting.threshold))
+    return Learned(jnp.stack([one.policy for one in found]), np.array([one.status for one in found]), np.array(excess))
 
 
-def _decisions(setting: Setting, model: MDP, anchored: bool) -> Decisions:
-    """Decisions that all draws share, unless each has a model of its own."""
+def excess_of(table: SimilarityTable, threshold: float) -> float:
+    """By how much the error of a pair that counts as similar may exceed epsilon; of all pairs that the table has met."""
+    upper = table.known()[1].upper
+    return float((upper[upper <= threshold + _SIMILARITY_TOLERANCE] - threshold).max(initial=0.0))
+
+
+def _table(setting: Setting, model: MDP, anchored: bool) -> SimilarityTable:
+    """What is known of the model's local models: shared by all draws and thresholds, unless each has its own model."""
     if setting.samples:
-        classes = local_model_classes(model, distance=setting.distance)
-        return Decisions(model, classes, setting.distance, anchored, _SIMILARITY_TOLERANCE, setting.threshold)
-    return _shared_decisions(setting.domain, setting.distance, setting.threshold, anchored)
+        return SimilarityTable(model, distance=setting.distance, anchored=anchored)
+    return _shared_table(setting.domain, setting.distance, anchored)
 
 
 @functools.lru_cache(maxsize=32)
-def _shared_decisions(domain: str, distance: int, threshold: float, anchored: bool) -> Decisions:
-    mdp, classes = _shared_classes(domain, distance)
-    return Decisions(mdp, classes, distance, anchored, _SIMILARITY_TOLERANCE, threshold)
-
-
-@functools.lru_cache(maxsize=8)
-def _shared_classes(domain: str, distance: int) -> tuple[MDP, LocalModelClasses]:
+def _shared_table(domain: str, distance: int, anchored: bool) -> SimilarityTable:
     mdp = build_domain(domain, 1 if domain.startswith("grid") else 0).bare
-    return mdp, local_model_classes(mdp, distance=distance)
+    return SimilarityTable(mdp, distance=distance, anchored=anchored)
 
 
 def generalize(function: Callable) -> Method:
@@ -100,13 +79,12 @@ def generalize(function: Callable) -> Method:
 
     def method(problem: Problem) -> Learned:
         pairs = zip(problem.models, problem.demonstrations, strict=True)
-        found = [function(model, shown, problem.domain.coordinates) for model, shown in pairs]
-        return Learned(jnp.stack([general.policy for general in found]))
+        return Learned(jnp.stack([function(*pair, problem.domain.coordinates).policy for pair in pairs]))
 
     return method
 
 
-maximum_entropy = generalize(lambda mdp, shown, _: jaxhom.maximum_entropy(mdp, shown))
+maximum_entropy = generalize(lambda mdp, shown, _: jaxhom.uniform_elsewhere(mdp, shown))
 manhattan_knn = generalize(lambda mdp, shown, _: jaxhom.nearest_neighbors(mdp, shown))
 euclidean_knn = generalize(
     lambda mdp, shown, coordinates: jaxhom.nearest_neighbors(mdp, shown, metric="euclidean", coordinates=coordinates)
@@ -114,12 +92,12 @@ euclidean_knn = generalize(
 regression = generalize(jaxhom.occupancy_regression)
 
 
-def apprentice(name: str, method: Method) -> Method:
+def apprentice(method: Method) -> Method:
     """LPAL on the feature expectations of a method's policies, started from them."""
 
     def learn(problem: Problem) -> Learned:
         mdp = problem.domain.mdp
-        policy = problem.once(name, lambda: method(problem)).policy
+        policy = problem.once(method).policy
         # `jaxhom.feature_expectations`, compiled once per domain and not once per number of features.
         expectations = jnp.einsum("bsa,sak->bk", jaxhom.occupancy(problem.domain.bare, policy), mdp.features)
         return _of_solution(mdp, jaxhom.lpal(mdp, expectations, initial_policy=policy))
@@ -130,16 +108,10 @@ def apprentice(name: str, method: Method) -> Method:
 def full_policy(problem: Problem) -> Learned:
     """LPAL on the expert's complete policy; solved once where all draws share it."""
     if problem.domain.weights is None:
-        return apprentice("expert", expert)(problem)
+        return apprentice(expert)(problem)
     mdp, policy = problem.domain.mdp, problem.expert.policy
-    expectations = jaxhom.feature_expectations(mdp, policy[:1])
-    learned = _of_solution(mdp, jaxhom.lpal(mdp, expectations, initial_policy=policy[:1]))
-    copies = len(policy)
-    return Learned(
-        jnp.broadcast_to(learned.policy, policy.shape),
-        np.repeat(learned.status, copies),
-        np.repeat(learned.certificate, copies),
-    )
+    solution = jaxhom.lpal(mdp, jaxhom.feature_expectations(mdp, policy[:1]), initial_policy=policy[:1])
+    return _of_solution(mdp, jax.tree.map(lambda leaf: jnp.repeat(leaf, len(policy), axis=0), solution))
 
 
 def monte_carlo(problem: Problem, *, per_step: bool = False) -> Learned:
@@ -162,37 +134,29 @@ def _of_solution(mdp, solution) -> Learned:
     return Learned(solution.policy, np.asarray(solution.status), np.asarray(gap))
 
 
-def plain(name: str, method: Method) -> Method:
-    """The method itself; its policies are kept for `apprentice(name, method)`."""
-    return lambda problem: problem.once(name, lambda: method(problem))
-
-
 TABLE1: dict[str, Method] = {
     "expert": expert,
     "full_policy": full_policy,
-    "soft_local_homomorphism": apprentice("soft", soft),
+    "soft_local_homomorphism": apprentice(soft),
     "monte_carlo": monte_carlo,
-    "maximum_entropy": apprentice("maximum_entropy", maximum_entropy),
-    "euclidean_knn": apprentice("euclidean_knn", euclidean_knn),
-    "regression": apprentice("regression", regression),
-    "manhattan_knn": apprentice("manhattan_knn", manhattan_knn),
+    "maximum_entropy": apprentice(maximum_entropy),
+    "euclidean_knn": apprentice(euclidean_knn),
+    "regression": apprentice(regression),
+    "manhattan_knn": apprentice(manhattan_knn),
 }
 """The columns of Table I, under the names of its file."""
-
+THRESHOLD: dict[str, Method] = {"expert": expert, "soft_local_homomorphism": soft, "manhattan_knn": manhattan_knn}
 FIGURE1: dict[str, Method] = {
     "expert": expert,
     "lpal_full_policy": full_policy,
-    "soft_local_homomorphism": plain("soft", soft),
+    "soft_local_homomorphism": soft,
     "soft_local_homomorphism_printed": functools.partial(soft, anchored=False),
     "soft_local_homomorphism_mutual": functools.partial(soft, mutual=True),
-    "manhattan_knn": plain("manhattan_knn", manhattan_knn),
-    "lpal_soft_local_homomorphism": apprentice("soft", soft),
-    "lpal_manhattan_knn": apprentice("manhattan_knn", manhattan_knn),
+    "manhattan_knn": manhattan_knn,
+    "lpal_soft_local_homomorphism": apprentice(soft),
+    "lpal_manhattan_knn": apprentice(manhattan_knn),
 }
 """The curves of Figure 1; Algorithm 1 also with the program as printed, and asking for similarity both ways."""
-
-THRESHOLD: dict[str, Method] = {"expert": expert, "soft_local_homomorphism": soft, "manhattan_knn": manhattan_knn}
-NOISE = THRESHOLD
 ENOUGH: dict[str, Method] = {**THRESHOLD, "maximum_entropy": maximum_entropy, "monte_carlo": monte_carlo}
 NORMALISATION: dict[str, Method] = {
     "monte_carlo": monte_carlo,

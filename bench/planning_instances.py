@@ -6,13 +6,19 @@ models) rewards uniform on [0, 1]. Discount 0.99, float64 (the caller enables `j
 
 import functools
 
-import jax
 import numpy as np
 
 import jaxhom
-from bench.lpal_instances import DISCOUNT, dense_garnet, region_of, sparse_garnet, track_weights
+from bench.lpal_instances import (
+    DISCOUNT,
+    dense_garnet,
+    region_of,
+    region_weights,
+    sparse_garnet,
+    track,
+    track_weights,
+)
 
-_SPARSE_STATES = 10_000
 _GRIDS = {"grid16": 16, "grid32": 32, "grid48": 48, "grid100": 100, "grid316": 316}
 TITLES = {name: f"{size}x{size} grid" for name, size in _GRIDS.items()} | {
     "racetrack_a": "racetrack a",
@@ -27,8 +33,8 @@ def build(name: str) -> jaxhom.MDP:
     if name in _GRIDS:
         return jaxhom.gridworld(_GRIDS[name], discount=DISCOUNT, dtype=np.float64).mdp
     if name == "racetrack_a":
-        return jaxhom.racetrack("a", discount=DISCOUNT, dtype=np.float64).mdp
-    return dense_garnet() if name == "garnet_dense" else sparse_garnet(_SPARSE_STATES)
+        return track("a")
+    return dense_garnet() if name == "garnet_dense" else sparse_garnet(10_000)
 
 
 def rewards(name: str, seed: int, lanes: int) -> np.ndarray:
@@ -40,8 +46,7 @@ def _reward(name: str, seed: int, lane: int) -> np.ndarray:
     mdp = build(name)
     if name in _GRIDS:
         num_regions = 64 if _GRIDS[name] < 100 else 100
-        key = jax.random.fold_in(jax.random.key(seed), lane)
-        weights = np.asarray(jaxhom.sample_weights(key, num_regions), float)
+        weights = region_weights(seed, lane, num_regions)
         return np.repeat(weights[region_of(_GRIDS[name], num_regions)][:, None], mdp.num_actions, axis=1)
     if name == "racetrack_a":
         return np.asarray(mdp.features @ track_weights(seed, lane, mdp.num_features))

@@ -63,11 +63,11 @@ class Problem:
     trial_keys: jax.Array
     found: dict = dataclasses.field(default_factory=dict)
 
-    def once(self, name: str, compute):
-        """`compute()`, the first time that `name` is asked for."""
-        if name not in self.found:
-            self.found[name] = compute()
-        return self.found[name]
+    def once(self, function):
+        """`function(problem)`, computed the first time that it is asked for."""
+        if function not in self.found:
+            self.found[function] = function(self)
+        return self.found[function]
 
 
 def draw_problem(setting: Setting, draws: tuple[int, ...], seed: int) -> Problem:
@@ -96,18 +96,12 @@ def build_domain(name: str, regions: int) -> Domain:
     """A domain by the names of `settings`."""
     if name.startswith("grid"):
         world = jaxhom.gridworld(int(name[4:]), num_regions=regions)
-        return Domain(mdp=world.mdp, bare=_without_features(world.mdp), coordinates=world.coordinates)
-    _, letter = name.split("_")
+        return Domain(world.mdp, _without_features(world.mdp), world.coordinates)
+    letter = name.removeprefix("track_")
     shipped = _TRACKS / f"{letter}.track"
     track = jaxhom.racetrack(shipped if shipped.exists() else letter)
-    return Domain(
-        mdp=track.mdp,
-        bare=_without_features(track.mdp),
-        coordinates=track.coordinates,
-        weights=track.weights,
-        terminal=track.terminal,
-        off_road=track.off_road,
-    )
+    parts = (track.coordinates, track.weights, track.terminal, track.off_road)
+    return Domain(track.mdp, _without_features(track.mdp), *parts)
 
 
 def _without_features(mdp: MDP) -> MDP:
@@ -134,9 +128,8 @@ def _plans(domain: Domain, reward: jax.Array) -> Plan:
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def _sample(keys, mdp, policies, num_trajectories, length) -> Demonstrations:
     """Trajectories [B, M, H], one key and policy per lane."""
-    return jax.vmap(lambda key, policy: jaxhom.sample_demonstrations(key, mdp, policy, num_trajectories, length))(
-        keys, policies
-    )
+    sample = jax.vmap(jaxhom.sample_demonstrations, in_axes=(0, None, 0, None, None))
+    return sample(keys, mdp, policies, num_trajectories, length)
 
 
 def _shown(setting: Setting, domain: Domain, samples: Demonstrations) -> list[Demonstrations]:
@@ -153,12 +146,10 @@ def _shown(setting: Setting, domain: Domain, samples: Demonstrations) -> list[De
 
 def _known_model(setting: Setting, domain: Domain, key) -> MDP:
     """The true model, or frequencies of `samples` transitions per state and action."""
-    if not setting.samples:
-        return domain.bare
     bare = domain.bare
-    seed = np.asarray(jax.random.key_data(key))
+    if not setting.samples:
+        return bare
     probability = np.asarray(bare.probability, float)
-    counts = np.random.default_rng(seed).multinomial(setting.samples, probability / probability.sum(-1, keepdims=True))
-    return MDP.from_successors(
-        bare.next_state, counts / setting.samples, discount=float(bare.discount), initial=bare.initial
-    )
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    estimated = rng.multinomial(setting.samples, probability / probability.sum(-1, keepdims=True)) / setting.samples
+    return MDP.from_successors(bare.next_state, estimated, discount=float(bare.discount), initial=bare.initial)

@@ -9,61 +9,26 @@ import argparse
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 
 from bench import methods, settings, summaries, sweep
-from bench.rows import ROOT, Row, RowFile
+from bench.provenance import RESULTS
+from bench.rows import RowFile
+from bench.sweep import Sweep
 
-
-@dataclasses.dataclass(frozen=True)
-class Experiment:
-    """A sweep by name: what it computes and how its rows are summed up.
-
-    Attributes:
-      name: of its files. settings: makes them. methods: by name. draws: of each setting, unless the user says.
-      summarise: lines of `columns` from rows. sampled: whether policies are also tried out in 1000 trials.
-    """
-
-    name: str
-    settings: Callable[[], list[settings.Setting]]
-    methods: dict[str, methods.Method]
-    draws: int = 20
-    summarise: Callable[[Sequence[Row]], list[dict]] = summaries.summarise_question
-    columns: Sequence[str] = summaries.QUESTION_COLUMNS
-    sampled: bool = False
-
-
-EXPERIMENTS = {
-    "table1": [
-        Experiment(
-            name="table1",
-            settings=settings.table1,
-            methods=methods.TABLE1,
-            draws=100,
-            summarise=summaries.summarise_table1,
-            columns=summaries.TABLE1_COLUMNS,
-            sampled=True,
-        )
-    ],
-    "figure1": [
-        Experiment(
-            name="figure1",
-            settings=settings.figure1,
-            methods=methods.FIGURE1,
-            draws=50,
-            summarise=summaries.summarise_figure1,
-            columns=summaries.FIGURE1_COLUMNS,
-        )
-    ],
-    "questions": [
-        Experiment("threshold", settings.threshold_question, methods.THRESHOLD),
-        Experiment("noise", settings.noise_question, methods.NOISE),
-        Experiment("enough", settings.enough_question, methods.ENOUGH),
-        Experiment("normalisation", settings.normalisation_question, methods.NORMALISATION),
-    ],
+SWEEPS = {
+    "table1": {"table1": Sweep(settings.table1(), methods.TABLE1, draws=100, sampled=True)},
+    "figure1": {"figure1": Sweep(settings.figure1(), methods.FIGURE1, draws=50)},
+    "questions": {
+        "threshold": Sweep(settings.threshold_question(), methods.THRESHOLD),
+        "noise": Sweep(settings.noise_question(), methods.THRESHOLD),
+        "enough": Sweep(settings.enough_question(), methods.ENOUGH),
+        "normalisation": Sweep(settings.normalisation_question(), methods.NORMALISATION),
+    },
 }
+"""By command, and by the name of the sweep's files."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,43 +36,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
-        chosen = [(e, work, RowFile(options.output / "raw" / f"{e.name}.csv")) for e, work in _chosen(options)]
+        chosen = [(name, work, RowFile(options.output / "raw" / f"{name}.csv")) for name, work in _chosen(options)]
     except ValueError as error:
         print(f"bench: error: {error}", file=sys.stderr)
         return 2
     try:
-        failed = sum(_run(experiment, work, file, options) for experiment, work, file in chosen)
+        failed = sum(_run(name, work, file, options) for name, work, file in chosen)
     except KeyboardInterrupt:
         print("bench: stopped; the same command goes on from here", file=sys.stderr)
         return 130
     return 1 if failed else 0
 
 
-def _chosen(options: argparse.Namespace) -> list[tuple[Experiment, sweep.Sweep]]:
-    """The experiments, with the settings and methods that the user asks for; those without any are left out.
+def _chosen(options: argparse.Namespace) -> list[tuple[str, Sweep]]:
+    """The sweeps, with the settings and methods that the user asks for; those without any are left out.
 
     Raises:
       ValueError: if an option is out of range or names nothing that there is.
     """
+    sweeps = SWEEPS[options.sweep]
     if options.draws is not None and options.draws < 1:
         raise ValueError(f"--draws must be at least 1, got {options.draws}")
-    experiments = EXPERIMENTS[options.sweep]
-    everything = [setting.name for experiment in experiments for setting in experiment.settings()]
     for pattern in options.rows:
-        if not any(_begins_like(name, pattern) for name in everything):
+        if not any(_begins_like(setting.name, pattern) for work in sweeps.values() for setting in work.settings):
             raise ValueError(f"--rows {pattern}: no setting of {options.sweep} begins like that")
+    names = {name for work in sweeps.values() for name in work.methods}
     for name in options.methods:
-        if not any(name in experiment.methods for experiment in experiments):
-            raise ValueError(f"--methods {name}: not one of {sorted({m for e in experiments for m in e.methods})}")
+        if name not in names:
+            raise ValueError(f"--methods {name}: not one of {sorted(names)}")
     found = []
-    for experiment in experiments:
-        rows = [
-            s for s in experiment.settings() if not options.rows or any(_begins_like(s.name, p) for p in options.rows)
-        ]
-        names = {name: m for name, m in experiment.methods.items() if not options.methods or name in options.methods}
-        if rows and names:
-            draws = options.draws or experiment.draws
-            found.append((experiment, sweep.Sweep(rows, names, draws, experiment.sampled, options.seed)))
+    for name, work in sweeps.items():
+        rows = [s for s in work.settings if not options.rows or any(_begins_like(s.name, p) for p in options.rows)]
+        wanted = {key: method for key, method in work.methods.items() if not options.methods or key in options.methods}
+        changes = {"settings": rows, "methods": wanted, "draws": options.draws or work.draws, "seed": options.seed}
+        if rows and wanted:
+            found.append((name, dataclasses.replace(work, **changes)))
     return found
 
 
@@ -117,28 +80,26 @@ def _begins_like(name: str, pattern: str) -> bool:
     return name.split("/")[: len(parts)] == parts
 
 
-def _run(experiment: Experiment, work: sweep.Sweep, file: RowFile, options: argparse.Namespace) -> int:
-    """Runs one experiment, writes its summary, and returns how many of its rows have failed."""
+def _run(name: str, work: Sweep, file: RowFile, options: argparse.Namespace) -> int:
+    """Runs one sweep, writes its summary, and returns how many of its rows have failed."""
     sweep.run(work, file, retry=options.retry)
     rows = [row for row in file.read() if row.seed == options.seed]
-    summary = options.output / f"{experiment.name}.csv"
-    summaries.write_csv(summary, experiment.columns, experiment.summarise(rows))
-    failed = sum(bool(row.error) for row in rows)
-    print(f"{summary}: {len(rows)} rows, {failed} failed")
+    path, failed = options.output / f"{name}.csv", sum(bool(row.error) for row in rows)
+    summaries.write_csv(path, summaries.of_sweep(name, rows))
+    print(f"{path}: {len(rows)} rows, {failed} failed")
     return failed
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line's options."""
     made = argparse.ArgumentParser(prog="python -m bench.reproduce", description=__doc__.splitlines()[0])
-    made.add_argument("sweep", choices=EXPERIMENTS)
+    made.add_argument("sweep", choices=SWEEPS)
     made.add_argument("--draws", "--sets", type=int, help="draws per row (default: table1 100, figure1 50, else 20)")
     made.add_argument("--rows", nargs="+", default=[], help="only these settings: grid16, grid16/64, track_a/2")
     made.add_argument("--methods", nargs="+", default=[], help="only these methods")
     made.add_argument("--seed", type=int, default=0, help="of all random numbers (default 0)")
     made.add_argument("--retry", action="store_true", help="compute rows that failed once more")
-    output = ROOT / "bench" / "results"
-    made.add_argument("--output", type=pathlib.Path, default=output, help="folder (default bench/results)")
+    made.add_argument("--output", type=pathlib.Path, default=RESULTS, help="folder (default bench/results)")
     return made
 
 

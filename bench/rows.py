@@ -7,18 +7,10 @@ If a row is computed again, the later one counts.
 
 import csv
 import dataclasses
-import functools
 import io
 import os
 import pathlib
-import platform
-import subprocess
 from collections.abc import Iterable
-from importlib import metadata
-
-import jaxhom
-
-ROOT = pathlib.Path(__file__).resolve().parent.parent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,9 +67,10 @@ class Row:
         return tuple(getattr(self, name) for name in KEY)
 
 
-KEY = tuple(field.name for field in dataclasses.fields(Row))[: 1 + list(Row.__annotations__).index("seed")]
-COLUMNS = tuple(field.name for field in dataclasses.fields(Row))
-_TYPES = {field.name: field.type for field in dataclasses.fields(Row)}
+_FIELDS = dataclasses.fields(Row)
+COLUMNS = tuple(field.name for field in _FIELDS)
+KEY = tuple(field.name for field in _FIELDS if field.default is dataclasses.MISSING)
+_READ = {str: str, int: int, float: float, int | None: int, float | None: float}
 
 
 class RowFile:
@@ -90,71 +83,43 @@ class RowFile:
     def __init__(self, path: pathlib.Path):
         self.path = pathlib.Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if not self.path.exists() or not _drop_partial_line(self.path):
-            self._write([COLUMNS])
-        self._check_header()
+        whole, header = _whole_lines(self.path), ",".join(COLUMNS) + "\n"
+        if not whole:
+            self.path.write_text(header)
+        elif not whole.startswith(header):
+            raise ValueError(f"{self.path} has other columns than this version writes: move it away to start anew")
+        else:
+            os.truncate(self.path, len(whole.encode()))
 
     def append(self, rows: Iterable[Row]) -> None:
         """Writes rows in one piece, and has the disk hold them before it returns."""
-        self._write([[_to_text(name, getattr(row, name)) for name in COLUMNS] for row in rows])
-
-    def read(self) -> list[Row]:
-        """The rows, the latest of each key."""
-        return read_rows(self.path)
-
-    def _check_header(self) -> None:
-        with self.path.open(newline="") as file:
-            header = next(csv.reader(file))
-        if tuple(header) != COLUMNS:
-            raise ValueError(f"{self.path} has other columns than this version writes: move it away to start anew")
-
-    def _write(self, lines: Iterable[Iterable[str]]) -> None:
         text = io.StringIO(newline="")
-        csv.writer(text, lineterminator="\n").writerows(lines)
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerows([[_to_text(name, getattr(row, name)) for name in COLUMNS] for row in rows])
         with self.path.open("a", newline="") as file:
             file.write(text.getvalue())
             file.flush()
             os.fsync(file.fileno())
 
+    def read(self) -> list[Row]:
+        """The rows, the latest of each key."""
+        return read_rows(self.path)
+
 
 def read_rows(path: pathlib.Path) -> list[Row]:
     """The rows of a file, the latest of each key, without changing it; a line cut short is left out."""
-    text = pathlib.Path(path).read_text()
-    lines = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
-    rows = (Row(**{name: _from_text(_TYPES[name], text) for name, text in line.items()}) for line in lines)
-    return list({row.key: row for row in rows}.values())
+    rows = {}
+    for line in csv.DictReader(io.StringIO(_whole_lines(pathlib.Path(path)), newline="")):
+        kinds = ((field.name, _READ[field.type], field.type is str) for field in _FIELDS)
+        row = Row(**{name: read(line[name]) if line[name] or is_text else None for name, read, is_text in kinds})
+        rows[row.key] = row
+    return list(rows.values())
 
 
-@functools.cache
-def provenance() -> dict[str, str]:
-    """The columns `commit` and `versions`."""
-    packages = ("jax", "jaxlib", "numpy", "scipy")
-    versions = [f"jaxhom {jaxhom.__version__}"] + [f"{name} {metadata.version(name)}" for name in packages]
-    versions.append(f"python {platform.python_version()} {platform.machine()}")
-    return {"commit": _commit(), "versions": "; ".join(versions)}
-
-
-def _commit() -> str:
-    """The commit of the checkout, with "+" if the code differs from it; empty outside a checkout."""
-
-    def git(*arguments):
-        command = ["git", "-C", str(ROOT), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        changed = git("status", "--porcelain", "--", "jaxhom", "bench", ":!bench/results")
-        return git("rev-parse", "--short=12", "HEAD") + ("+" if changed else "")
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-
-
-def _drop_partial_line(path: pathlib.Path) -> bool:
-    """Cuts off what follows the last line break; returns whether anything is left."""
-    content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        os.truncate(path, whole)
-    return whole > 0
+def _whole_lines(path: pathlib.Path) -> str:
+    """What a file holds up to its last line break."""
+    text = path.read_bytes().decode() if path.exists() else ""
+    return text[: text.rfind("\n") + 1]
 
 
 def _to_text(name: str, value) -> str:
@@ -163,13 +128,3 @@ def _to_text(name: str, value) -> str:
     if isinstance(value, float):
         return repr(value) if name in KEY else format(value, ".10g")  # keys are to come back as they were
     return " ".join(str(value).split())  # one line
-
-
-def _from_text(kind, text: str):
-    if kind is str:
-        return text
-    if kind is int:
-        return int(text)
-    if kind is float:
-        return float(text)
-    return None if text == "" else (int(text) if kind == int | None else float(text))

@@ -58,8 +58,7 @@ def grid(size: int, regions: int, demonstrations: int = GRID_DEMONSTRATIONS, poo
 
 def track(domain: str, demonstrations: int, pool: int, **options) -> Setting:
     """A racetrack of section VI.B."""
-    length, trial = TRACK_LENGTHS[domain]
-    return Setting(domain, 0, demonstrations, pool, length, trial, **options)
+    return Setting(domain, 0, demonstrations, pool, *TRACK_LENGTHS[domain], **options)
 
 
 def table1() -> list[Setting]:
@@ -81,24 +80,15 @@ def threshold_question() -> list[Setting]:
     """
     thresholds = (0.0, 0.1, 0.19, 0.23, 0.28, 0.4, 0.46, 0.55, 0.8, 1.0)
     few = (0.0, 0.23, 0.4, 0.55, 0.8)  # local models of up to 21 states take their time
-    return [
-        track(domain, 2, 10, distance=distance, threshold=threshold)
-        for domain, distance, chosen in (
-            ("track_a", 1, thresholds),
-            ("track_corner", 1, thresholds),
-            ("track_corner", 2, few),
-        )
-        for threshold in chosen
-    ]
+    chosen = {("track_a", 1): thresholds, ("track_corner", 1): thresholds, ("track_corner", 2): few}
+    return [track(name, 2, 10, distance=d, threshold=e) for (name, d), values in chosen.items() for e in values]
 
 
 def noise_question() -> list[Setting]:
     """A model estimated from few transitions, and the threshold that forgives it."""
-    return [
-        track("track_corner", 2, 10, threshold=threshold, samples=samples)
-        for samples in (5, 20, 100, 1000, 0)
-        for threshold in (0.0, 0.05, 0.1, 0.19, 0.28, 0.4, 0.55)
-    ]
+    thresholds = (0.0, 0.05, 0.1, 0.19, 0.28, 0.4, 0.55)
+    samples = (5, 20, 100, 1000, 0)
+    return [track("track_corner", 2, 10, threshold=e, samples=count) for count in samples for e in thresholds]
 
 
 def enough_question() -> list[Setting]:

@@ -1,13 +1,11 @@
 """Measures the similarity engine and its peers on the same instances, judged by the same certificate.
 
-Each section runs in a process of its own (`python -m bench.similarity_speed SECTION`), which prints its rows as JSON:
-so a first call there is cold, compilation included, and the number of XLA's host devices can be set per section. Every
-time is the median of three calls after a first one that compiles; `compile_s` is what the first took beyond the second.
+Each section runs in a process of its own, so that a first call there is cold, compilation included. Every time of ours
+is the median of three calls after a first one; `compile_s` is what the first took beyond them. Peers are measured as
+`bench.processes` says, and what they spend on building their programs counts.
 """
 
-import argparse
-import statistics
-import time
+import functools
 from collections.abc import Iterator
 
 import jax
@@ -16,54 +14,62 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
-from jaxhom.similarity.homomorphism import ClassSimilarity  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import peers  # noqa: E402
-from bench.speed_rows import commit, print_row, versions  # noqa: E402
+from bench import lp_peers  # noqa: E402
+from bench.linear_programs import Conic, Homomorphisms  # noqa: E402
+from bench.lp_peers import Settings  # noqa: E402
+from bench.processes import Found, NoAnswer, measure, timed  # noqa: E402
+from bench.provenance import provenance  # noqa: E402
 from jaxhom.generalization.global_lp import GlobalHomomorphismProblem  # noqa: E402
-from jaxhom.similarity.brackets import bracket_errors  # noqa: E402
+from jaxhom.similarity.brackets import Goal, bracket_errors  # noqa: E402
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem  # noqa: E402
-from jaxhom.similarity.local_models import local_model_classes, restricted_model  # noqa: E402
+from jaxhom.similarity.local_models import restricted_model  # noqa: E402
 from jaxhom.solvers import pdhg  # noqa: E402
+from jaxhom.solvers.lane_queue import is_settled  # noqa: E402
 
 NUM_ACTIONS = 4
-GAP = 1e-4
-THRESHOLD = 0.05
-GLOBAL_GAP = 1e-3
-SIZES = (3, 5, 8, 13, 25)
+GAP = 1e-4  # the library's default tolerance
+THRESHOLD = 0.05  # which some of the random pairs of five states are within, and some are not
+GLOBAL_GAP = 1e-3  # HiGHS takes minutes for a tenth of it
+SIZES = (3, 5, 8, 13, 25)  # 5 is a cell of a grid and its neighbours, 13 and 25 what is two and three steps away
 OUR_PAIRS = {3: 2048, 5: 2048, 8: 512, 13: 128, 25: 32}
 PEER_PAIRS = {  # larger ones take a peer minutes
     "highs_simplex": {3: 512, 5: 512, 8: 64, 13: 4},
     "mpax": {3: 64, 5: 64, 8: 32, 13: 8},
     "others": {3: 512, 5: 512, 8: 128, 13: 32, 25: 2},
 }
+_TIGHT = {"run_crossover": "off", "primal_feasibility_tolerance": 1e-7, "dual_feasibility_tolerance": 1e-7}
+PEERS = {  # tolerances a tenth of the gap, HiGHS without what only costs time here
+    "highs_simplex": Settings(1e-7, {"presolve": "off"}),
+    "highs_interior_point": Settings(0.1 * GAP, _TIGHT),
+    "moreau": Settings(0.1 * GAP),
+    "mpax": Settings(0.1 * GAP, {"sparse": False}),
+}
 MAX_PDHG_SIZE = 8  # tight brackets of larger random models take it a tenth of a second a pair, and more
 OUR_COUNTS = (1, 8, 64, 512, 4096, 32768)
 PEER_COUNTS = (1, 8, 64, 512)
-_HIGHS_SECONDS = 300.0
+_LIMIT = 300.0  # seconds for a peer's row
 _PACKAGES = ("jax", "highspy", "moreau", "mpax")
-
-# --------------------------------------------------------------------------------------------------- rows and timing
 
 
 def row(work: str, method: str, pairs: int, seconds: float | None = None, **fields) -> dict:
     """One row of the table; what is not given stays empty."""
-    base = {"work": work, "method": method, "pairs": pairs, "device": jax.default_backend()}
-    base |= {"devices": jax.device_count(), "processes": 1, "dtype": "float64", "gap_asked": GAP, "status": "measured"}
+    base = {"work": work, "method": method, "pairs": pairs, "device": jax.default_backend(), "gap_asked": GAP}
+    base |= {"devices": jax.device_count(), "processes": 1, "dtype": "float64", "status": "measured"}
     if seconds is not None:
         base |= {"seconds": seconds, "ms_per_pair": 1e3 * seconds / max(pairs, 1)}
-    return base | {"versions": versions(*_PACKAGES), "commit": commit()} | fields
+    return base | provenance(*_PACKAGES) | fields
 
 
-def timed(call, repeats: int = 3):
-    """(result, compile seconds, median seconds) of a call that returns when its answer is there."""
-    seconds = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        result = jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - start)
-    return result, max(seconds[0] - seconds[1], 0.0), statistics.median(seconds[1:])
+def ready(call):
+    """A call that returns when its answer is there."""
+    return lambda: jax.block_until_ready(call())
+
+
+def sizes(n: int, m: int | None = None, actions: int = NUM_ACTIONS) -> dict:
+    """Fields: states of both models, and actions."""
+    return {"n": n, "m": n if m is None else m, "actions": actions}
 
 
 def random_pairs(n: int, count: int, dtype=np.float64) -> tuple[np.ndarray, np.ndarray]:
@@ -88,125 +94,140 @@ def pair_problem(source: np.ndarray, target: np.ndarray) -> HomomorphismProblem:
     )
 
 
-def feasible_map(f: np.ndarray) -> np.ndarray:
-    """Clips a solver's map and makes its rows sum to 1; leading axes stay."""
+def certified(problem, answers: list, anchored: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Our bounds [P] of a peer's maps f [n, m] and multipliers y [n, A, m]; f is made a map first."""
+    f, y = map(np.stack, zip(*answers, strict=True))
     f = np.maximum(f, 0.0)
-    return f / np.maximum(f.sum(axis=-1, keepdims=True), 1e-300)
-
-
-def certify(source, target, f, y) -> tuple[np.ndarray, np.ndarray]:
-    """Our bounds [P] of a peer's maps f [P, n, m] and multipliers y [P, n, A, m]."""
-    problem = pair_problem(source, target)
-    f = feasible_map(f)
-    f[:, 0] = np.eye(f.shape[2])[0]
-    f, y = jnp.moveaxis(jnp.asarray(f), 0, -1), jnp.moveaxis(jnp.asarray(y), 0, -1)
+    f /= np.maximum(f.sum(axis=-1, keepdims=True), 1e-300)
+    if anchored:
+        f[:, 0] = np.eye(f.shape[2])[0]
+    f, y = (jnp.moveaxis(jnp.asarray(array), 0, -1) for array in (f, y))
     lower, upper = problem.bounds(f, y, problem.forward(f), problem.adjoint(y))
     return np.asarray(lower), np.asarray(upper)
 
 
-def judged(lower, upper, *, threshold: float | None = None) -> dict:
+def judged(lower, upper, *, asked: float = GAP, threshold: float = np.nan) -> dict:
     """Worst gap, and the share of pairs that are settled."""
     gap = np.asarray(upper - lower)
-    settled = gap <= GAP
-    if threshold is not None:
-        settled |= (lower > threshold) | (upper <= threshold + GAP)
+    settled = is_settled(lower, upper, asked, threshold)
     return {"gap_certified": float(gap.max()), "settled": float(settled.mean())}
 
 
 # --------------------------------------------------------------------------------------------- random pairs, our side
 
 
-def our_pairs(n: int, count: int, method: str, dtype=np.float64, threshold=None, work="brackets") -> dict:
+def our_pairs(n: int, count: int, method: str, dtype=np.float64, threshold=np.nan, work="brackets") -> dict:
     """Brackets or decisions of random pairs."""
     source, target = random_pairs(n, count, dtype)
+    goal = Goal(tolerance=GAP, threshold=threshold, method=method)
 
     def call():
-        return bracket_errors(source, target, tolerance=GAP, threshold=threshold, method=method)
+        return bracket_errors(source, target, goal=goal)
 
-    found, compile_s, seconds = timed(call)
-    fields = {"n": n, "m": n, "actions": NUM_ACTIONS, "dtype": np.dtype(dtype).name, "compile_s": compile_s}
-    fields |= judged(found.lower, found.upper, threshold=threshold)
-    return row(work, f"jaxhom {method}", count, seconds, **fields)
+    found, first, seconds = timed(ready(call))
+    fields = sizes(n) | {"dtype": np.dtype(dtype).name, "compile_s": max(first - seconds, 0.0)}
+    return row(
+        work, f"jaxhom {method}", count, seconds, **fields, **judged(found.lower, found.upper, threshold=threshold)
+    )
 
 
-def section_brackets(quick: bool) -> list[dict]:
+def section_brackets(quick: bool) -> Iterator[dict]:
     """Random pairs of every size, each method of ours."""
-    rows = []
     for n in (3, 5) if quick else SIZES:
         count = 8 if quick else OUR_PAIRS[n]
-        rows.append(our_pairs(n, count, "interior_point"))
-        if n <= (3 if quick else MAX_PDHG_SIZE):
-            rows += [our_pairs(n, count, "pdhg", dtype) for dtype in (np.float64, np.float32)]
-    return rows
+        yield our_pairs(n, count, "interior_point")
+        for dtype in (np.float64, np.float32) if n <= (3 if quick else MAX_PDHG_SIZE) else ():
+            yield our_pairs(n, count, "pdhg", dtype)
 
 
-def section_counts(quick: bool) -> list[dict]:
+def section_counts(quick: bool) -> Iterator[dict]:
     """Random pairs of five states, few and many."""
-    rows = [our_pairs(5, count, "auto", work="counts") for count in ((8,) if quick else OUR_COUNTS)]
+    for count in (8,) if quick else OUR_COUNTS:
+        yield our_pairs(5, count, "auto", work="counts")
     for method in ("highs_simplex", "moreau"):
-        rows += [peer_pairs(method, 5, count, "counts") for count in (() if quick else PEER_COUNTS)]
-    return rows
+        for count in () if quick else PEER_COUNTS:
+            yield peer_pairs(method, 5, count, "counts")
 
 
-def section_decisions(quick: bool) -> list[dict]:
+def section_decisions(quick: bool) -> Iterator[dict]:
     """e <= 0.05 for random pairs of five states."""
-    count = 8 if quick else OUR_PAIRS[5]
-    dtypes = (np.float64, np.float32)
-    return [our_pairs(5, count, "auto", dtype, THRESHOLD, "decisions") for dtype in dtypes]
+    for dtype in (np.float64, np.float32):
+        yield our_pairs(5, 8 if quick else OUR_PAIRS[5], "auto", dtype, THRESHOLD, "decisions")
 
 
-def section_gradients(quick: bool) -> list[dict]:
+def section_gradients(quick: bool) -> Iterator[dict]:
     """Value and both gradients of random pairs of five states."""
-    count = 8 if quick else 512
-    source, target = map(jnp.asarray, random_pairs(5, count))
-    fields = {"n": 5, "m": 5, "actions": NUM_ACTIONS}
-    ours = jax.jit(jax.vmap(jax.value_and_grad(jaxhom.homomorphism_error, argnums=(0, 1))))
-    (value, _), compile_s, seconds = timed(lambda: ours(source, target))
-    exact = bracket_errors(np.asarray(source), np.asarray(target), tolerance=1e-6)
-    away = _distance(value, exact)
-    fields |= {"gap_certified": away, "settled": 1.0, "compile_s": compile_s, "gap_asked": 1e-6}
-    fields["note"] = "gap: distance of the value from a bracket of 1e-6"
-    rows = [row("value and gradient", "jaxhom", count, seconds, **fields)]
-    if quick:
-        return rows
-    return [*rows, _moreau_gradients(source, target, exact, fields)]
+    source, target = map(jnp.asarray, random_pairs(5, 8 if quick else 512))
+    exact = bracket_errors(np.asarray(source), np.asarray(target), goal=Goal(1e-6))
+
+    def measured(method, value, asked):
+        function = jax.jit(jax.vmap(jax.value_and_grad(value, argnums=(0, 1))))
+        (found, _), first, seconds = timed(ready(lambda: function(source, target)))
+        away = float(np.maximum(np.maximum(exact.lower - found, found - exact.upper), 0.0).max())
+        fields = sizes(5) | {"gap_certified": away, "settled": 1.0, "gap_asked": asked}
+        fields |= {"compile_s": max(first - seconds, 0.0), "note": "gap: distance of the value from a bracket of 1e-6"}
+        return row("value and gradient", method, len(source), seconds, **fields)
+
+    yield measured("jaxhom", jaxhom.homomorphism_error, 1e-6)
+    if not quick and lp_peers.is_installed("moreau"):
+        yield measured("moreau", _moreau_error(5, GAP), GAP)
+    elif not quick:
+        yield row("value and gradient", "moreau", len(source), status="not installed")
 
 
-def _distance(value, exact) -> float:
-    return float(np.maximum(np.maximum(exact.lower - value, value - exact.upper), 0.0).max())
+def _moreau_error(n: int, gap: float):
+    """The error of a pair of models with n states by Moreau, which JAX can differentiate."""
+    from jax.experimental.sparse import BCOO
+    from moreau.jax import Solver
 
+    pair = [models[0] for models in random_pairs(n, 1)]
+    programs = Homomorphisms(*pair, anchored=True)
+    lp = programs.given(pair)
+    conic, fill = Conic(lp), BCOO.from_scipy_sparse(programs.fill)
+    solver = Solver(**lp_peers.moreau_arguments(conic, 0.1 * gap, enable_grad=True))
+    q, b = jnp.asarray(lp.cost), jnp.asarray(conic.right(lp))
 
-def _moreau_gradients(source, target, exact, fields) -> dict:
-    if not peers.is_installed("moreau"):
-        return row("value and gradient", "moreau", len(source), status="not installed")
-    call = peers.moreau_value_and_gradient(5, 5, NUM_ACTIONS, GAP)
-    (value, _), compile_s, seconds = timed(lambda: call(source, target))
-    fields = fields | {"gap_certified": _distance(value, exact), "compile_s": compile_s, "gap_asked": GAP}
-    return row("value and gradient", "moreau", len(source), seconds, **fields)
+    def value(source, target):
+        entries = fill @ jnp.concatenate([source.ravel(), target.ravel(), jnp.ones(1)])
+        matrix = conic.sign * jnp.append(entries, 1.0)[conic.take]
+        return solver.solve(jnp.zeros(0), matrix, q, b).x[-1]
+
+    return value
 
 
 # -------------------------------------------------------------------------------------------------------------- peers
 
 
+def solved(method: str, pairs: list, settings: Settings, anchored: bool, processes: int) -> Found:
+    """LPs (8) or (9) of pairs of models by a peer."""
+    make = functools.partial(Homomorphisms, *pairs[0], anchored)
+    options = {"method": method, "settings": settings, "make": make}
+    package, together = lp_peers.PEERS[method][0], method in ("moreau", "mpax")
+    return measure("lp_peers:Opened", options, pairs, _LIMIT, package=package, together=together, processes=processes)
+
+
 def peer_pairs(method: str, n: int, count: int, work: str = "brackets") -> dict:
     """Brackets of random pairs by a peer, certified by us."""
-    fields = {"n": n, "m": n, "actions": NUM_ACTIONS, "device": "cpu"}
-    if not peers.is_installed(method):
+    fields = sizes(n) | {"device": "cpu"}
+    if not lp_peers.is_installed(method):
         return row(work, method, 0, **fields, status="not installed")
     source, target = random_pairs(n, count)
+    pairs, processes = list(zip(source, target, strict=True)), 1 if method in lp_peers.USES_BOTH_CORES else 2
     try:
-        answer = peers.solve_pairs(method, source, target, GAP)
-    except Exception as error:  # a peer that fails is a row, not the end of the benchmark
-        return row(work, method, count, **fields, status="failed", note=f"{type(error).__name__}: {error}")
-    fields |= {"processes": answer.processes, "compile_s": answer.compile_s, "build_s": answer.build_s}
-    fields |= judged(*certify(source, target, answer.f, answer.y))
-    return row(work, method, count, answer.seconds, **fields)
+        found = solved(method, pairs, PEERS[method], anchored=True, processes=processes)
+        if len(found.answers) < count:
+            raise NoAnswer("time limit", f"{len(found.answers)} of {count} pairs in {_LIMIT:g} s")
+    except NoAnswer as error:  # a row, not the end of the benchmark
+        return row(work, method, count, **fields, **error.fields)
+    fields |= {"processes": found.processes, "compile_s": found.compile_s, "build_s": found.build_s}
+    fields |= judged(*certified(pair_problem(source, target), found.answers, anchored=True))
+    return row(work, method, count, found.build_s + sum(found.seconds), **fields)
 
 
 def section_peers(quick: bool) -> Iterator[dict]:
     """Random pairs of every size, each peer."""
     for n in (3, 5) if quick else SIZES:
-        for method in peers.MODULES:
+        for method in PEERS:
             count = PEER_PAIRS.get(method, PEER_PAIRS["others"]).get(n)
             if count and (method.startswith("highs") or not quick):
                 yield peer_pairs(method, n, 8 if quick else count)
@@ -217,19 +238,10 @@ def section_peers(quick: bool) -> Iterator[dict]:
 
 def cold_and_warm(work: str, method: str, pairs: int, call, describe, repeats: int = 3) -> list[dict]:
     """Rows of the first call in this process and, if it is repeated, of the median of the next."""
-    start = time.perf_counter()
-    result = jax.block_until_ready(call())
-    cold = time.perf_counter() - start
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - start)
-    fields = describe(result) | ({"compile_s": max(cold - seconds[0], 0.0)} if seconds else {})
+    result, cold, seconds = timed(ready(call), repeats)
+    fields = describe(result) | ({"compile_s": max(cold - seconds, 0.0)} if repeats else {})
     rows = [row(f"{work}, cold", method, pairs, cold, **fields)]
-    if seconds:
-        rows.append(row(f"{work}, warm", method, pairs, statistics.median(seconds), **fields))
-    return rows
+    return rows + [row(f"{work}, warm", method, pairs, seconds, **fields)] * bool(repeats)
 
 
 def section_racetrack(quick: bool) -> list[dict]:
@@ -237,14 +249,13 @@ def section_racetrack(quick: bool) -> list[dict]:
     mdp = jaxhom.racetrack("a").mdp
 
     def call():
-        classes = local_model_classes(mdp)
-        number = len(classes.representative)
-        similarity = ClassSimilarity(mdp, classes, 1, True, GAP, None)
-        pairs = np.stack(np.meshgrid(np.arange(number), np.arange(number), indexing="ij"), -1).reshape(-1, 2)
-        found = similarity.solve(pairs)
-        table = (bound.reshape(number, number) for bound in (found.lower, found.upper))
-        index = np.ix_(classes.label, classes.label)
-        return tuple(bounds[index] for bounds in table), number
+        table = jaxhom.SimilarityTable(mdp)
+        classes = table.classes()
+        number = table.num_classes
+        _, first = np.unique(classes, return_index=True)  # a state of each class
+        found = table.brackets(np.repeat(first, number), np.tile(first, number), tolerance=GAP)
+        index = np.ix_(classes, classes)
+        return tuple(bound.reshape(number, number)[index] for bound in (found.lower, found.upper)), number
 
     def describe(result):
         (lower, upper), number = result
@@ -256,8 +267,7 @@ def section_racetrack(quick: bool) -> list[dict]:
 def section_algorithm1(quick: bool) -> list[dict]:
     """Algorithm 1 on the racetrack with ten demonstrations."""
     track = jaxhom.racetrack("a")
-    weights = jnp.asarray([5.0, 200.0])
-    policy = jaxhom.optimal_policy(track.mdp, track.mdp.features @ weights).policy
+    policy = jaxhom.optimal_policy(track.mdp, track.mdp.features @ track.weights).policy
     demonstrations = jaxhom.sample_demonstrations(jax.random.key(0), track.mdp, policy, 10, 20)
 
     def describe(result):
@@ -278,15 +288,13 @@ def grid_demonstrations(size: int, horizon: int):
     return mdp, jaxhom.sample_demonstrations(jax.random.key(2), mdp, policy, 10, horizon)
 
 
-def section_global(quick: bool) -> list[dict]:
+def section_global(quick: bool) -> Iterator[dict]:
     """LP (8): ours on the 16 x 16 grid and on the grids that HiGHS takes too."""
-    rows = []
     for size in (4,) if quick else (6, 8, 10, 16):
         mdp, demonstrations = grid_demonstrations(size, 50)
-        rows += our_global(size, mdp, demonstrations, repeats=1)
-        if size <= 10 and peers.is_installed("highs_interior_point"):
-            rows.append(highs_global(size, mdp, demonstrations))
-    return rows
+        yield from our_global(size, mdp, demonstrations, repeats=1)
+        if size <= 10 and lp_peers.is_installed("highs_interior_point"):
+            yield highs_global(size, mdp, demonstrations)
 
 
 def section_global_large(quick: bool) -> list[dict]:
@@ -300,10 +308,9 @@ def our_global(size: int, mdp, demonstrations, repeats: int, **options) -> list[
 
     def describe(result):
         lower, upper = float(result.error_lower), float(result.error_upper)
-        certified = {"gap_certified": upper - lower, "settled": float(upper - lower <= GLOBAL_GAP)}
-        note = f"{size} x {size} grid, e in [{lower:.5f}, {upper:.5f}]"
-        sizes = {"n": mdp.num_states, "m": int(result.visited.sum()), "actions": mdp.num_actions}
-        return sizes | certified | {"gap_asked": GLOBAL_GAP, "note": note}
+        fields = sizes(mdp.num_states, int(result.visited.sum()), mdp.num_actions)
+        fields |= judged(np.array(lower), np.array(upper), asked=GLOBAL_GAP)
+        return fields | {"gap_asked": GLOBAL_GAP, "note": f"{size} x {size} grid, e in [{lower:.5f}, {upper:.5f}]"}
 
     def call():
         return jaxhom.soft_homomorphism(mdp, demonstrations, tolerance=GLOBAL_GAP, **options)
@@ -313,85 +320,49 @@ def our_global(size: int, mdp, demonstrations, repeats: int, **options) -> list[
 
 def highs_global(size: int, mdp, demonstrations) -> dict:
     """LP (8) by HiGHS's interior point, certified by us."""
-    import highspy
-
-    start = time.perf_counter()
+    method, settings = "highs_interior_point", Settings(0.1 * GLOBAL_GAP, _TIGHT)
     experts = np.unique(np.asarray(demonstrations.states)[np.asarray(demonstrations.mask)])
-    problem = GlobalHomomorphismProblem(
-        mdp=mdp,
-        restricted=jnp.asarray(restricted_model(mdp, experts)),
-        pinned=jnp.zeros((mdp.num_states, len(experts)), bool),
-    )
-    matrix, num_equalities = _global_matrix(mdp, np.asarray(problem.restricted))
-    lp = peers.highs_model(matrix.indptr, matrix.indices, matrix.data, num_equalities, np.full(matrix.shape[1], np.inf))
-    build = time.perf_counter() - start
-    solver = highspy.Highs()
-    solver.passOptions(peers.highs_options("highs_interior_point", GLOBAL_GAP, _HIGHS_SECONDS))
-    x, multipliers = peers.run_highs(solver, lp, num_equalities)
-    seconds = time.perf_counter() - start
-    fields = {"n": mdp.num_states, "m": len(experts), "actions": mdp.num_actions, "gap_asked": GLOBAL_GAP}
-    fields |= {"build_s": build, "note": f"{size} x {size} grid, one process", "device": "cpu"}
-    fields["note"] += f", {solver.modelStatusToString(solver.getModelStatus())}"
-    if len(x) != matrix.shape[1] or len(multipliers) != len(matrix.indptr) - 1 - num_equalities:
-        return row("LP (8), cold", "highs_interior_point", 1, seconds, **fields, status="failed")
-    f = jnp.asarray(feasible_map(x[:-1].reshape(mdp.num_states, -1)))[..., None]
-    plus, minus = np.split(multipliers, 2)
-    y = jnp.asarray((plus - minus).reshape(mdp.num_states, mdp.num_actions, -1))[..., None]
-    lower, upper = problem.bounds(f, y, problem.forward(f), problem.adjoint(y))
-    gap = float(upper[0] - lower[0])
-    fields |= {"gap_certified": gap, "settled": float(gap <= GLOBAL_GAP)}
-    return row("LP (8), cold", "highs_interior_point", 1, seconds, **fields)
-
-
-def _global_matrix(mdp, restricted: np.ndarray):
-    """CSR constraints of LP (8): rows of f sum to 1, then K f - e, then -K f - e."""
-    import scipy.sparse as sparse
-
-    num_states, num_experts = mdp.num_states, len(restricted)
-    states, actions, _ = np.indices(mdp.next_state.shape)
-    entries = (
-        np.asarray(mdp.probability).ravel(),
-        ((states * mdp.num_actions + actions).ravel(), np.asarray(mdp.next_state).ravel()),
-    )
-    transition = sparse.csr_array(entries, shape=(num_states * mdp.num_actions, num_states))
-    transition.eliminate_zeros()
-    mapped = sparse.csr_array(restricted.transpose(1, 2, 0).reshape(-1, num_experts))
-    product = sparse.kron(transition, sparse.eye_array(num_experts)) - sparse.kron(sparse.eye_array(num_states), mapped)
-    rows = sparse.kron(sparse.eye_array(num_states), np.ones((1, num_experts)))
-    error = sparse.csr_array(-np.ones((product.shape[0], 1)))
-    blocks = [[rows, sparse.csr_array((num_states, 1))], [product, error], [-product, error]]
-    return sparse.csr_array(sparse.block_array(blocks)), num_states
+    restricted = restricted_model(mdp, experts)
+    fields = sizes(mdp.num_states, len(experts), mdp.num_actions) | {"gap_asked": GLOBAL_GAP, "device": "cpu"}
+    try:
+        found = solved(method, [(np.asarray(mdp.transition), restricted)], settings, anchored=False, processes=1)
+    except NoAnswer as error:
+        return row("LP (8), cold", method, 1, **fields, **error.fields)
+    fields |= {"build_s": found.build_s, "note": f"{size} x {size} grid, one process, {found.words[0]}"}
+    pinned = jnp.zeros((mdp.num_states, len(experts)), bool)
+    problem = GlobalHomomorphismProblem(mdp=mdp, restricted=jnp.asarray(restricted), pinned=pinned)
+    fields |= judged(*certified(problem, found.answers, anchored=False), asked=GLOBAL_GAP)
+    return row("LP (8), cold", method, 1, found.build_s + sum(found.seconds), **fields)
 
 
 # --------------------------------------------------------------------------------------------- floating-point peak
 
 
-def section_peak(quick: bool) -> list[dict]:
+def section_peak(quick: bool) -> Iterator[dict]:
     """What a large product reaches, and the share of it that a PDHG iteration does."""
-    rows = []
     size = 256 if quick else 2048
     for dtype in (np.float64, np.float32):
         matrix = jnp.asarray(np.random.default_rng(0).random((size, size)), dtype)
         product = jax.jit(lambda a: a @ a)
-        _, compile_s, seconds = timed(lambda matrix=matrix, product=product: product(matrix))
+        _, first, seconds = timed(ready(lambda matrix=matrix, product=product: product(matrix)))
         peak = 2.0 * size**3 / seconds
-        fields = {"dtype": np.dtype(dtype).name, "compile_s": compile_s, "gflops": peak / 1e9, "gap_asked": None}
-        rows.append(row("peak", f"matrix product of {size}", 1, seconds, **fields))
-        rows += [_iteration(n, dtype, peak) for n in ((5,) if quick else SIZES)]
-    return rows
+        fields = {"dtype": np.dtype(dtype).name, "compile_s": max(first - seconds, 0.0)}
+        fields |= {"gflops": peak / 1e9, "gap_asked": None}
+        yield row("peak", f"matrix product of {size}", 1, seconds, **fields)
+        for n in (5,) if quick else SIZES:
+            yield _iteration(n, dtype, peak)
 
 
-def _iteration(n: int, dtype, peak: float, lanes: int = 64) -> dict:
-    """One iteration of a batch of PDHG lanes, from a call of `pdhg.step`."""
+def _iteration(n: int, dtype, peak: float, lanes: int = 64, calls: int = 20) -> dict:
+    """One iteration of a batch of PDHG lanes, from calls of `pdhg.step`: enough of them for the clock."""
     problem = pair_problem(*random_pairs(n, lanes, dtype))
-    state = pdhg.init(problem)
-    step = jax.jit(pdhg.step)
-    _, compile_s, seconds = timed(lambda: [step(problem, state).lower.block_until_ready() for _ in range(20)])
-    seconds /= 20 * pdhg.STEPS_PER_CHECK
+    state, step = pdhg.init(problem), jax.jit(pdhg.step)
+    _, first, seconds = timed(lambda: [step(problem, state).lower.block_until_ready() for _ in range(calls)])
+    fields = sizes(n) | {"dtype": np.dtype(dtype).name, "compile_s": max(first - seconds, 0.0)}
+    seconds /= calls * pdhg.STEPS_PER_CHECK
     flops = 4.0 * n * NUM_ACTIONS * n * (n + n) * lanes
     # Both models for K and for K^T; the iterate read, its anchor read, the next written.
     numbers = lanes * (2 * NUM_ACTIONS * 2 * n * n + 3 * (n * n + n * NUM_ACTIONS * n))
-    fields = {"n": n, "m": n, "actions": NUM_ACTIONS, "dtype": np.dtype(dtype).name, "compile_s": compile_s}
     fields |= {"gflops": flops / seconds / 1e9, "peak_fraction": flops / seconds / peak, "gap_asked": None}
     fields |= {"gbytes_per_s": numbers * np.dtype(dtype).itemsize / seconds / 1e9}
     return row("one PDHG iteration", "jaxhom pdhg", lanes, seconds, **fields)
@@ -402,15 +373,7 @@ SECTIONS = {
 }
 
 
-def main() -> None:
-    """Prints the rows of one section as JSON lines, the last lines of the output."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("section", choices=sorted(SECTIONS))
-    parser.add_argument("--quick", action="store_true")
-    arguments = parser.parse_args()
-    for found in SECTIONS[arguments.section](arguments.quick):
-        print_row(found)
-
-
-if __name__ == "__main__":
-    main()
+def section(name: str, quick: bool, methods: None, limit: None) -> Iterator[dict]:
+    """All rows of a section."""
+    del methods, limit
+    yield from SECTIONS[name](quick)

@@ -9,39 +9,150 @@ its own (`bench.similarity_speed`, `bench.lpal_speed`, `bench.planning_speed`).
 """
 
 import argparse
+import contextlib
+import csv
+import dataclasses
 import pathlib
 import sys
+from collections.abc import Iterator
+from types import ModuleType
 
-from bench import lpal_report, planning_report, similarity_report, speed_rows
+from bench import lpal_report, planning_report, similarity_report
+from bench.processes import NoAnswer, Worker
+from bench.provenance import RESULTS
 
-KINDS = {"similarity": similarity_report.KIND, "lpal": lpal_report.KIND, "planning": planning_report.KIND}
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """One kind of benchmark.
+
+    Attributes:
+      title: for the command line's help.
+      sections: all of them, in the order of the file; quick: those of a quick run.
+      fields: the columns.
+      shown: the fields that are printed while it runs.
+      report: has `table(rows)`, Markdown, and `figure(rows)`, None if there is nothing to draw.
+      has_methods: whether the user may choose methods and a limit.
+    """
+
+    title: str
+    sections: tuple[str, ...]
+    quick: tuple[str, ...]
+    fields: tuple[str, ...]
+    shown: tuple[str, ...]
+    report: ModuleType
+    has_methods: bool = False
+
+
+KINDS = {
+    "similarity": Kind(
+        title="local and global homomorphisms, against other LP solvers",
+        sections=(
+            *("peak", "brackets", "counts", "decisions", "gradients", "peers"),
+            *("racetrack", "algorithm1", "global", "global_large"),
+        ),
+        quick=("brackets", "decisions", "gradients", "peers"),
+        fields=(
+            *("section", "work", "n", "m", "actions", "pairs", "method", "dtype", "device", "devices", "processes"),
+            *("gap_asked", "gap_certified", "settled", "compile_s", "build_s", "seconds", "ms_per_pair"),
+            *("gflops", "peak_fraction", "gbytes_per_s", "status", "note", "versions", "commit"),
+        ),
+        shown=("work", "method", "dtype", "n", "pairs", "ms_per_pair"),
+        report=similarity_report,
+    ),
+    "lpal": Kind(
+        title="LPAL, against other LP solvers",
+        sections=(  # the instances, small ones first
+            *("grid16", "grid16_exact", "grid16_monte_carlo", "grid24", "bumps24", "grid32", "grid48", "grid48_exact"),
+            *("grid48_monte_carlo", "garnet", "racetrack_a", "racetrack_b", "bumps48", "grid100", "grid316"),
+        ),
+        quick=("grid16", "racetrack_b"),
+        fields=(
+            *("section", "instance", "S", "A", "K", "lanes", "method", "processes", "dtype", "device"),
+            *("seconds", "compile_s", "build_s", "gap_asked", "gap_certified", "settled", "iterations"),
+            *("status", "note", "versions", "commit"),
+        ),
+        shown=("method", "lanes", "seconds", "settled", "status", "note"),
+        report=lpal_report,
+        has_methods=True,
+    ),
+    "planning": Kind(
+        title="planning and occupancies, against MDP toolboxes and SciPy",
+        sections=planning_report.SECTIONS,
+        quick=("grid16", "garnet_sparse"),
+        fields=(
+            *("section", "instance", "work", "S", "A", "lanes", "method", "processes", "dtype", "device"),
+            *("seconds", "compile_s", "build_s", "error_asked", "error", "settled", "iterations"),
+            *("status", "note", "versions", "commit"),
+        ),
+        shown=("work", "method", "lanes", "seconds", "settled", "status", "note"),
+        report=planning_report,
+        has_methods=True,
+    ),
+}
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, writes rows after each of them, and reports."""
-    kind, path = KINDS[arguments.kind], arguments.output
+    kind, path, methods = KINDS[arguments.kind], arguments.output, arguments.methods
     if not arguments.report:
-        methods = getattr(arguments, "methods", None)
         wanted = arguments.sections or (kind.quick if arguments.quick else kind.sections)
-        stays = path.exists() and (arguments.sections or methods)
-        rows = speed_rows.read(path) if stays else []
+        rows = read(path) if path.exists() and (arguments.sections or methods) else []
+        options = {"quick": arguments.quick, "methods": methods, "limit": arguments.limit}
         for section in wanted:
             print(section, file=sys.stderr, flush=True)
-            rows = speed_rows.replace_rows(rows, section, methods)
-            for row in speed_rows.measure(kind, section, _options(arguments)):
+            rows = replace_rows(rows, section, methods)
+            for row in measure(arguments.kind, section, options):
                 rows.append(row)
                 rows.sort(key=lambda row: kind.sections.index(row["section"]))
-                speed_rows.write(path, rows, kind.fields)
-    kind.report(speed_rows.read(path), path)
+                write(path, rows, kind.fields)
+    report(kind, path)
 
 
-def _options(arguments: argparse.Namespace) -> list[str]:
-    options = ["--quick"] * arguments.quick
-    if getattr(arguments, "methods", None):
-        options += ["--methods", *arguments.methods]
-    if getattr(arguments, "limit", None):
-        options += ["--limit", str(arguments.limit)]
-    return options
+def report(kind: Kind, path: pathlib.Path) -> None:
+    """The table and the figure, beside the CSV file."""
+    rows = read(path)
+    path.with_suffix(".md").write_text(kind.report.table(rows))
+    figure = kind.report.figure(rows)
+    if figure is not None:
+        figure.savefig(path.with_suffix(".png"), dpi=130)
+
+
+def measure(kind: str, section: str, options: dict) -> Iterator[dict]:
+    """Rows of one section, measured in a process of its own; a section that fails is a row too."""
+    arguments = {"name": section} | options
+    with contextlib.closing(Worker(f"bench.{kind}_speed", "section", arguments)) as worker:
+        try:
+            while (row := worker.receive()) is not None:
+                print("  ", *(_short(row.get(name, "")) for name in KINDS[kind].shown), file=sys.stderr, flush=True)
+                yield {"section": section} | row
+        except NoAnswer as error:
+            yield {"section": section} | error.fields
+
+
+def read(path: pathlib.Path) -> list[dict]:
+    """Rows of a CSV file, all fields as text."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(path: pathlib.Path, rows: list[dict], fields: tuple[str, ...]) -> None:
+    """Writes rows as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fields)
+        writer.writeheader()
+        writer.writerows([{name: _short(value) for name, value in row.items()} for row in rows])
+
+
+def replace_rows(rows: list[dict], section: str, methods: list[str] | None) -> list[dict]:
+    """The rows that stay when a section is measured again: those of other sections, and of methods not asked for."""
+    begins = tuple(methods or [""])
+    return [row for row in rows if row["section"] != section or not row["method"].startswith(begins)]
+
+
+def _short(value):
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def main() -> None:
@@ -53,7 +164,8 @@ def main() -> None:
         command.add_argument("--quick", action="store_true", help="a few small instances, to see that it runs")
         command.add_argument("--sections", nargs="+", choices=kind.sections, help="only these; rows of others stay")
         command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
-        command.add_argument("--output", type=pathlib.Path, default=pathlib.Path(f"bench/results/speed_{name}.csv"))
+        command.add_argument("--output", type=pathlib.Path, default=RESULTS / f"speed_{name}.csv")
+        command.set_defaults(methods=None, limit=None)
         if kind.has_methods:
             command.add_argument("--methods", nargs="+", help="only those whose names begin so; rows of others stay")
             command.add_argument("--limit", type=float, help="seconds that a measurement may take")

@@ -17,14 +17,15 @@ import numpy as np
 from tqdm import tqdm
 
 import jaxhom
-from bench.methods import Learned, Method
+from bench.methods import Method
 from bench.problems import Problem, draw_problem
-from bench.rows import Row, RowFile, provenance
+from bench.provenance import provenance
+from bench.rows import KEY, Row, RowFile
 from bench.settings import Setting
 from jaxhom import Status
 
-BATCH = 50
-_NUM_TRIALS = 1000
+BATCH = 50  # draws: all of a point of Figure 1, and half of a row of Table I
+_NUM_TRIALS = 1000  # as many as the paper's
 _BAR = "{desc}{percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
 
 
@@ -41,7 +42,7 @@ class Sweep:
 
     settings: Sequence[Setting]
     methods: Mapping[str, Method]
-    draws: int
+    draws: int = 20
     sampled: bool = False
     seed: int = 0
 
@@ -108,92 +109,81 @@ def _tasks(sweep: Sweep, done: set) -> list[_Task]:
     for first in range(0, sweep.draws, BATCH):
         draws = tuple(range(first, min(first + BATCH, sweep.draws)))
         for setting in sweep.settings:
-            blanks = {name: [_blank(setting, name, draw, sweep.seed) for draw in draws] for name in sweep.methods}
+            shared = {name: getattr(setting, name) for name in KEY if hasattr(setting, name)} | {"seed": sweep.seed}
+            blanks = {name: [Row(**shared, method=name, draw=draw) for draw in draws] for name in sweep.methods}
             missing = {name: [row for row in rows if row.key not in done] for name, rows in blanks.items()}
             tasks.append(_Task(setting, draws, {name: rows for name, rows in missing.items() if rows}))
     return [task for task in tasks if task.missing]
 
 
-def _blank(setting: Setting, method: str, draw: int, seed: int) -> Row:
-    """The key of a row, without numbers."""
-    fields = {field.name for field in dataclasses.fields(Row)}
-    shared = {name: value for name, value in dataclasses.asdict(setting).items() if name in fields}
-    return Row(**shared, method=method, draw=draw, seed=seed)
-
-
 def _compute(sweep: Sweep, task: _Task) -> Iterator[list[Row]]:
     """The missing rows of a task, method by method. A batch is computed whole: its shapes are compiled already."""
-    problem = None
+    problems: dict[tuple[int, ...], Problem] = {}
+
+    def results(method: Method, draws: tuple[int, ...]) -> list[dict]:
+        """Per draw, the numbers of a row or its error; if the batch fails, draw by draw."""
+        try:
+            if draws not in problems:
+                problems[draws] = draw_problem(task.setting, draws, sweep.seed)
+            return _results(problems[draws], method, sweep.sampled)
+        except Exception as error:  # of whichever draw: it alone is to have no numbers
+            if len(draws) == 1:
+                return [{"error": f"{type(error).__name__}: {error}"[:300], "batch": 1}]
+            return [result for draw in draws for result in results(method, (draw,))]
+
     for name, blanks in task.missing.items():
         start = time.perf_counter()
-        try:
-            problem = problem or draw_problem(task.setting, task.draws, sweep.seed)
-            results = _results(problem, sweep.methods[name], sweep.sampled)
-        except Exception:  # of whichever draw: it alone is to have no numbers
-            results = _results_one_by_one(sweep, task, name)
-        shared = {"seconds": (time.perf_counter() - start) / len(task.draws), **provenance()}
-        found = dict(zip(task.draws, results, strict=True))
+        found = dict(zip(task.draws, results(sweep.methods[name], task.draws), strict=True))
+        shared = {"seconds": (time.perf_counter() - start) / len(task.draws)}
+        shared |= provenance("jax", "jaxlib", "numpy", "scipy")
         yield [dataclasses.replace(blank, **found[blank.draw], **shared) for blank in blanks]
-
-
-def _results_one_by_one(sweep: Sweep, task: _Task, method: str) -> list[dict]:
-    """Per draw, the numbers of a row or its error."""
-    results = []
-    for draw in task.draws:
-        try:
-            problem = draw_problem(task.setting, (draw,), sweep.seed)
-            results += _results(problem, sweep.methods[method], sweep.sampled)
-        except Exception as error:
-            results.append({"error": f"{type(error).__name__}: {error}"[:300], "batch": 1})
-    return results
 
 
 def _results(problem: Problem, method: Method, sampled: bool) -> list[dict]:
     """Per draw, the numbers of a row."""
-    learned = method(problem)
+    learned = problem.once(method)
     # A policy that is not finite is refused by whatever evaluates it: another stands in, so that its batch goes on.
     is_good = np.isfinite(learned.policy).all(axis=(1, 2))
     policy = jnp.where(is_good[:, None, None], learned.policy, 1.0 / learned.policy.shape[-1])
-    columns = _evaluated(problem, dataclasses.replace(learned, policy=policy), sampled)
-    lanes = range(len(learned.policy))
-    results = [{name: float(column[lane]) for name, column in columns.items()} for lane in lanes]
-    for lane, result in enumerate(results):
+    columns = _evaluated(problem, policy, sampled)
+    columns["certificate"] = columns["loss_bound"] if learned.certificate is None else learned.certificate
+    results = []
+    for lane, good in enumerate(is_good):
         status = "none" if learned.status is None else Status(int(learned.status[lane])).name
-        result |= {"status": status, "dtype": str(learned.policy.dtype), "batch": len(problem.draws)}
-    return [r if good else {"error": "the policy is not finite"} for r, good in zip(results, is_good, strict=True)]
+        numbers = {name: float(column[lane]) for name, column in columns.items()}
+        numbers |= {"status": status, "dtype": str(learned.policy.dtype), "batch": len(problem.draws)}
+        results.append(numbers if good else {"error": "the policy is not finite"})
+    return results
 
 
-def _evaluated(problem: Problem, learned: Learned, sampled: bool) -> dict[str, np.ndarray]:
-    """The numeric columns of a row, [B] each."""
-    domain, policy = problem.domain, learned.policy
+def _evaluated(problem: Problem, policy: jax.Array, sampled: bool) -> dict[str, np.ndarray]:
+    """The numeric columns of a row, [B] each: exact, in trials of the setting's length, and sampled."""
+    domain = problem.domain
+
+    def run_trials(key, policy, reward):
+        options = {"num_trials": _NUM_TRIALS, "terminal": domain.terminal}
+        return jaxhom.evaluate_by_sampling(key, domain.bare, policy, reward, problem.setting.trial, **options)
+
     exact = _evaluate(problem, policy)
-    expert = problem.once("expert_reward", lambda: _evaluate(problem, problem.expert.policy).reward_per_step)
     value = jaxhom.policy_value(domain.bare, policy, problem.reward)
     loss = (problem.expert.upper_bound(domain.bare) - value) @ domain.bare.initial * (1.0 - domain.bare.discount)
-    columns = {"reward_per_step": exact.reward_per_step, "expert_reward": expert, "loss_bound": loss}
-    columns["certificate"] = loss if learned.certificate is None else learned.certificate
+    columns = {"reward_per_step": exact.reward_per_step, "loss_bound": loss}
+    columns["expert_reward"] = problem.once(_expert_reward)
     if domain.terminal is not None:
         columns |= {"steps": exact.steps, "off_roads": exact.events["off_road"], "finished": exact.finished}
     if sampled:
-        trials = _run_trials(problem, policy)
+        trials = jax.vmap(run_trials)(problem.trial_keys, policy, problem.reward)
         columns |= {"sampled_reward": trials.reward_per_step, "sampled_error": trials.standard_error.reward_per_step}
     return {name: np.asarray(column) for name, column in columns.items()}
 
 
-def _evaluate(problem: Problem, policy: jax.Array):
+def _evaluate(problem: Problem, policy: jax.Array) -> jaxhom.Evaluation:
     """Exact evaluation in trials of the setting's length."""
     domain = problem.domain
+    options = {"horizon": problem.setting.trial, "terminal": domain.terminal}
     events = None if domain.off_road is None else {"off_road": domain.off_road}
-    options = {"terminal": domain.terminal, "events": events}
-    return jaxhom.evaluate_exactly(domain.bare, policy, problem.reward, horizon=problem.setting.trial, **options)
+    return jaxhom.evaluate_exactly(domain.bare, policy, problem.reward, events=events, **options)
 
 
-def _run_trials(problem: Problem, policy: jax.Array):
-    """1000 sampled trials per draw, each draw with random numbers of its own."""
-    domain = problem.domain
-
-    def run(key, policy, reward):
-        options = {"num_trials": _NUM_TRIALS, "terminal": domain.terminal}
-        return jaxhom.evaluate_by_sampling(key, domain.bare, policy, reward, problem.setting.trial, **options)
-
-    return jax.vmap(run)(problem.trial_keys, policy, problem.reward)
+def _expert_reward(problem: Problem) -> jax.Array:
+    return _evaluate(problem, problem.expert.policy).reward_per_step

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 
-from bench.comparison import DIFFERS, ONE_DRAW, Cell
-from bench.intervals import Interval
+import pandas as pd
+
+from bench.summaries import DIFFERS, ONE_DRAW
 
 HEADINGS = {
     "expert": "expert",
@@ -15,40 +16,39 @@ HEADINGS = {
     "regression": "regression",
     "manhattan_knn": "Manhattan k-NN",
 }
-
-MARKS = {DIFFERS: "*", ONE_DRAW: "†"}
-
-
-def table1_reward(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: average reward per step, ours and (in brackets) the paper's."""
-    return _table1(cells, lambda cell: _cell(cell.reward, cell.paper_reward, 1.0, 3))
+_MARKS = {DIFFERS: "*", ONE_DRAW: "†"}
+Table = tuple[list[str], list[list[str]]]  # header and rows
 
 
-def table1_ratio(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: percent of the expert's reward in the same draw, marked where the paper's differs."""
+def table1_reward(cells: pd.DataFrame) -> Table:
+    """Average reward per step, ours and (in brackets) the paper's."""
+    return _table1(cells, lambda cell: _cell(cell.draws, cell.mean, cell.ci_low, cell.ci_high, cell.paper, 3))
 
-    def show(cell: Cell) -> str:
-        return _cell(cell.ratio, cell.paper_ratio, 100.0, 1) + MARKS.get(cell.verdict, "")
+
+def table1_ratio(cells: pd.DataFrame) -> Table:
+    """Percent of the expert's reward in the same draw, marked where the paper's differs."""
+
+    def show(cell) -> str:
+        numbers = (100.0 * x for x in (cell.ratio, cell.ratio_ci_low, cell.ratio_ci_high, cell.paper_ratio))
+        return _cell(cell.draws, *numbers, 1) + _MARKS.get(cell.verdict, "")
 
     return _table1(cells, show)
 
 
-def _table1(cells: Sequence[Cell], show) -> tuple[list[str], list[list[str]]]:
-    found = {(cell.grid, cell.regions, cell.method): cell for cell in cells}
-    methods = [name for name in HEADINGS if any(cell.method == name for cell in cells)]
-    rows = []
-    for grid, regions in sorted({(cell.grid, cell.regions) for cell in cells}):
-        row = [found.get((grid, regions, method)) for method in methods]
-        rows.append([f"{grid}x{grid}", str(regions)] + ["" if cell is None else show(cell) for cell in row])
+def _table1(cells: pd.DataFrame, show) -> Table:
+    found = {(cell.grid, cell.regions, cell.method): show(cell) for cell in cells.itertuples()}
+    methods = [name for name in HEADINGS if name in set(cells["method"])]
+    rows = [
+        [f"{grid}x{grid}", str(regions), *(found.get((grid, regions, method), "") for method in methods)]
+        for grid, regions in sorted({key[:2] for key in found})
+    ]
     return ["grid", "regions"] + [HEADINGS[name] for name in methods], rows
 
 
-def _cell(interval: Interval, paper: float, scale: float, digits: int) -> str:
+def _cell(draws: int, mean: float, low: float, high: float, paper: float, digits: int) -> str:
     """Mean, half-width of the interval, and the paper's number."""
-    text = f"{scale * interval.mean:.{digits}f}"
-    if interval.count > 1:
-        text += f" ±{scale * interval.half_width:.{digits}f}"
-    return text if paper != paper else f"{text} ({scale * paper:.{digits}f})"
+    text = f"{mean:.{digits}f}" + (f" ±{0.5 * (high - low):.{digits}f}" if draws > 1 else "")
+    return text if paper != paper else f"{text} ({paper:.{digits}f})"
 
 
 def to_markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

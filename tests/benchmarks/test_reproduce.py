@@ -13,15 +13,13 @@ import numpy as np
 import pytest
 import scipy.stats
 from interrupt_often import watching
-from jaxhom.similarity.homomorphism import ClassSimilarity
 
 from bench import comparison, problems, report, reproduce, settings, summaries, sweep, tables
-from bench.intervals import mean_interval
-from bench.methods import FIGURE1, TABLE1, Decisions, Learned, manhattan_knn, monte_carlo, soft
+from bench.methods import FIGURE1, TABLE1, Learned, excess_of, manhattan_knn, monte_carlo, soft
 from bench.rows import Row, RowFile, read_rows
 from bench.settings import Setting
-from jaxhom import Demonstrations, LocalSimilarity, empirical_policy
-from jaxhom.similarity.local_models import local_model_classes
+from bench.summaries import mean_interval
+from jaxhom import Demonstrations, SimilarityTable, empirical_policy
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent.parent
 SETTING = Setting("grid4", regions=4, demonstrations=2, pool=2, length=5, trial=5)
@@ -129,16 +127,13 @@ def test_algorithm_1_says_how_it_ended(problem):
     assert (learned.status == 0).all() and (learned.certificate <= 1e-4).all()
 
 
-def test_decisions_keep_the_worst_end(problem, monkeypatch):
-    """The status of the worst pair, and the largest excess over epsilon of those that were accepted."""
-    lower, status = np.zeros(3), np.array([0, 2, 1])
-    found = LocalSimilarity(lower=lower, upper=np.array([0.1, 0.10005, 0.3]), iterations=status, status=status)
-    monkeypatch.setattr(ClassSimilarity, "solve", lambda self, pairs, **options: found)
-    mdp = problem.domain.bare
-    decisions = Decisions(mdp, local_model_classes(mdp), 1, True, 1e-4, 0.1)
-    assert (decisions.status, decisions.excess) == (0, 0.0)
-    assert decisions.solve(np.zeros((3, 2), int)) is found
-    assert decisions.status == 2 and decisions.excess == pytest.approx(5e-5)
+def test_the_excess_is_that_of_the_pairs_that_count_as_similar(problem):
+    """Of a table that has met all pairs: by how much the worst upper bound that is accepted exceeds epsilon."""
+    table = SimilarityTable(problem.domain.bare).complete(0.3)
+    upper = table.known()[1].upper
+    accepted = upper[upper <= 0.3 + 1e-4]
+    assert excess_of(table, 0.3) == max(accepted.max() - 0.3, 0.0) and len(accepted) < len(upper)
+    assert excess_of(table, float(accepted.max()) - 5e-5) == pytest.approx(5e-5)
 
 
 def test_monte_carlo_per_step_is_even_over_regions(problem):
@@ -241,7 +236,7 @@ from bench import methods, reproduce, settings
 
 chosen = {name: getattr(methods, name) for name in ("expert", "manhattan_knn")}
 tiny = [settings.Setting("grid4", 4, 2, 2, 5, 5, threshold=0.1 * i) for i in range(20)]
-reproduce.EXPERIMENTS["questions"] = [reproduce.Experiment("tiny", lambda: tiny, chosen, draws=2)]
+reproduce.SWEEPS["questions"] = {"tiny": reproduce.Sweep(tiny, chosen, draws=2)}
 if __name__ == "__main__":
     sys.exit(reproduce.main(sys.argv[1:]))
 """
@@ -268,7 +263,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path, monkeypatch):
         rows = read_rows(path)
         assert rows[: len(kept)] == kept and len(kept) < len(rows) < 80
         kept = rows
-    monkeypatch.setitem(reproduce.EXPERIMENTS, "questions", None)
+    monkeypatch.setitem(reproduce.SWEEPS, "questions", None)
     exec(TINY, {"__name__": "tiny"})
     assert reproduce.main(command) == 0
     rows = read_rows(path)
@@ -282,16 +277,16 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["table1", "figure1", "questions"])
 def test_settings_and_methods_of_the_shipped_experiments(name):
-    for experiment in reproduce.EXPERIMENTS[name]:
-        names = [setting.name for setting in experiment.settings()]
+    for sweeping in reproduce.SWEEPS[name].values():
+        names = [setting.name for setting in sweeping.settings]
         assert len(set(names)) == len(names)
     if name == "table1":
-        rows = {(int(s.domain[4:]), s.regions, m) for s in experiment.settings() for m in experiment.methods}
-        assert rows == set(summaries.paper_table1()) and experiment.draws >= 100
+        rows = {(int(s.domain[4:]), s.regions, m) for s in sweeping.settings for m in sweeping.methods}
+        assert rows == set(summaries.paper_table1()) and sweeping.draws >= 100
     if name == "figure1":
-        points = {(setting.domain, setting.demonstrations) for setting in experiment.settings()}
+        points = {(setting.domain, setting.demonstrations) for setting in sweeping.settings}
         assert points == {("track_a", n) for n in range(2, 11)} | {("track_b", n) for n in range(10, 101, 10)}
-        assert set(experiment.methods) == set(FIGURE1) and experiment.draws >= 50
+        assert set(sweeping.methods) == set(FIGURE1) and sweeping.draws >= 50
 
 
 @pytest.mark.parametrize(
@@ -322,16 +317,17 @@ def table1_rows(ratios, method="maximum_entropy"):
 def test_table1_summary():
     """Means by hand; the order is that of the numbers, whichever rows came first; failed rows do not count."""
     rows = [dataclasses.replace(row, domain="grid48") for row in table1_rows([0.5])] + table1_rows([0.8, 0.9])
-    lines = summaries.summarise_table1([*rows, blank(7, error="failed")])
-    assert [(line["grid"], line["method"], line["draws"]) for line in lines] == [
+    lines = summaries.table1([*rows, blank(7, error="failed")])
+    assert list(lines[["grid", "method", "draws"]].itertuples(index=False, name=None)) == [
         (16, "expert", 2),
         (16, "maximum_entropy", 2),
         (48, "expert", 1),
         (48, "maximum_entropy", 1),
     ]
-    assert lines[1]["mean"] == pytest.approx(0.425) and lines[1]["ratio"] == pytest.approx(0.85)
+    line = lines.iloc[1]
+    assert line["mean"] == pytest.approx(0.425) and line["ratio"] == pytest.approx(0.85)
     half = scipy.stats.t.ppf(0.975, 1) * 0.05  # two values 0.1 apart
-    assert lines[1]["ratio_ci_high"] == pytest.approx(0.85 + half) and lines[1]["paper"] == 0.3825
+    assert line["ratio_ci_high"] == pytest.approx(0.85 + half) and line["paper"] == 0.3825
 
 
 def test_verdicts():
@@ -341,8 +337,8 @@ def test_verdicts():
     texts = {"agrees": "", "one draw": "a single draw may differ as much", "differs": "by more than draws and trials"}
     for shift, verdict in ((0.0, "agrees"), (0.04, "one draw"), (0.2, "differs")):
         rows = table1_rows(ratio + shift + spread)
-        cells = comparison.compare_table1(rows)
-        found = {cell.method: cell.verdict for cell in cells}
+        cells = summaries.table1(rows)
+        found = dict(zip(cells["method"], cells["verdict"], strict=True))
         assert found == {"expert": "agrees", "maximum_entropy": verdict}
         words = " ".join(comparison.table1_words(cells, comparison.compare_orders(rows)))
         assert ("**maximum_entropy** differs" in words) == (verdict != "agrees") and texts[verdict] in words
@@ -355,8 +351,8 @@ def test_an_order_that_is_not_the_papers_is_said_in_words():
     rows = table1_rows(1.1 + np.linspace(-0.01, 0.01, 5))
     (order,) = comparison.compare_orders(rows)
     assert (order.better, order.worse) == ("expert", "maximum_entropy")
-    assert not order.is_reproduced and order.is_reversed
-    words = comparison.table1_words(comparison.compare_table1(rows), [order])
+    assert order.ours.high < 0
+    words = comparison.table1_words(summaries.table1(rows), [order])
     assert any(text.startswith("Not reproduced: expert above maximum_entropy") for text in words)
 
 
@@ -411,7 +407,8 @@ def test_report_from_rows_alone(tmp_path):
     assert {line.count("&") for line in body} == {3}
     for name in ("figure1.png", "figure1.svg", "table1.md"):
         assert (tmp_path / name).stat().st_size > 100
-    assert tuple(read_csv(tmp_path / "figure1.csv")[0]) == summaries.FIGURE1_COLUMNS
+    names = ("track", "demonstrations", "method", "metric", "sets", "mean", "ci_low", "ci_high")
+    assert tuple(read_csv(tmp_path / "figure1.csv")[0]) == names
     assert tuple(read_csv(tmp_path / "table1.csv")[0]) == summaries.TABLE1_COLUMNS
     before = {path.name: path.read_bytes() for path in tmp_path.glob("*.*")}
     assert report.main(["--results", str(tmp_path)]) == 0

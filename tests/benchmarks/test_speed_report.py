@@ -9,9 +9,11 @@ import pytest
 import scipy.optimize
 
 import jaxhom
-from bench import limits, lpal_report, planning_report, similarity_report, speed, speed_rows
+from bench import lp_peers, lpal_report, planning_report, processes, speed
+from bench.linear_programs import Conic, Homomorphisms, Lpal
+from bench.lp_peers import Settings
 from bench.lpal_instances import INSTANCES, regions
-from bench.lpal_program import ConicProgram, Model, Program
+from bench.models import Model
 
 
 def lpal_row(method, lanes, seconds, section="grid16", states=256, **fields):
@@ -37,12 +39,12 @@ LPAL_ROWS = [
 @pytest.fixture
 def lpal_path(tmp_path):
     path = tmp_path / "rows.csv"
-    speed_rows.write(path, LPAL_ROWS, lpal_report.FIELDS)
+    speed.write(path, LPAL_ROWS, speed.KINDS["lpal"].fields)
     return path
 
 
 def test_ratios_are_to_the_best_settled_peer_of_the_same_column(lpal_path):
-    rows = speed_rows.read(lpal_path)
+    rows = speed.read(lpal_path)
     best = lpal_report.best_peers(rows)
     assert best == {("grid16", False): 0.4, ("grid16", True): 0.1, ("grid48", False): 9.0, ("grid48", True): 9.0}
     table = lpal_report.table(rows)
@@ -54,7 +56,7 @@ def test_ratios_are_to_the_best_settled_peer_of_the_same_column(lpal_path):
 
 
 def test_curves_hold_settled_rows_by_states(lpal_path):
-    found = lpal_report.curves(speed_rows.read(lpal_path))
+    found = lpal_report.curves(speed.read(lpal_path))
     assert found["jaxhom", False] == [(256, 0.2), (2304, 3.0)]
     assert found["moreau", True] == [(256, 0.1)]
     assert not any(method in ("clarabel", "mpax") for method, _ in found)
@@ -70,7 +72,7 @@ def test_report_writes_table_and_figure(kind, lpal_path, tmp_path, monkeypatch):
             for work, lanes, method in itertools.product(planning_report.WORKS, (1, 32), ("jaxhom", "another"))
         ]
         path = tmp_path / "planning.csv"
-        speed_rows.write(path, rows, planning_report.FIELDS)
+        speed.write(path, rows, speed.KINDS["planning"].fields)
     monkeypatch.setattr("sys.argv", ["speed", kind, "--report", "--output", str(path)])
     speed.main()
     text = path.with_suffix(".md").read_text()
@@ -80,21 +82,21 @@ def test_report_writes_table_and_figure(kind, lpal_path, tmp_path, monkeypatch):
 
 def test_rows_of_other_sections_and_methods_stay():
     rows = [lpal_row("jaxhom", 1, 1.0), lpal_row("glop", 1, 1.0), lpal_row("jaxhom", 1, 1.0, "grid48")]
-    assert speed_rows.replace_rows(rows, "grid16", None) == rows[2:]
-    assert speed_rows.replace_rows(rows, "grid16", ["jaxhom"]) == rows[1:]
+    assert speed.replace_rows(rows, "grid16", None) == rows[2:]
+    assert speed.replace_rows(rows, "grid16", ["jaxhom"]) == rows[1:]
 
 
 def test_kinds_name_their_sections():
-    assert set(lpal_report.SECTIONS) == set(INSTANCES)
+    assert set(speed.KINDS["lpal"].sections) == set(INSTANCES)
     assert set(lpal_report.OVER_STATES) <= set(INSTANCES)
-    for report in (lpal_report, planning_report, similarity_report):
-        assert set(report.QUICK) <= set(report.SECTIONS) and len(set(report.FIELDS)) == len(report.FIELDS)
+    for kind in speed.KINDS.values():
+        assert set(kind.quick) <= set(kind.sections) and len(set(kind.fields)) == len(kind.fields)
 
 
 def test_committed_rows_have_the_fields(request):
     path = request.config.rootpath / "bench" / "results" / "speed_similarity.csv"
     with path.open(newline="") as file:
-        assert set(csv.DictReader(file).fieldnames) == set(similarity_report.FIELDS)
+        assert set(csv.DictReader(file).fieldnames) == set(speed.KINDS["similarity"].fields)
 
 
 # ----------------------------------------------------------------------------------------------------------- programs
@@ -112,13 +114,13 @@ def small():
 @pytest.mark.parametrize("shares", [False, True])
 def test_both_programs_have_the_value_that_lpal_certifies(small, form, shares):
     mdp, expectations = small
-    program = Program(Model.of(mdp), form, shares)
+    program = Lpal(Model.of(mdp), form, shares)
     lp, ours = program.given(expectations), jaxhom.lpal(mdp, expectations)
-    is_equation = lp.row_lower == lp.row_upper
+    is_equation = lp.is_equation
     matrix = lp.matrix.toarray()
     bounds = [(low if np.isfinite(low) else None, None) for low in lp.lower]
-    equations = {"A_eq": matrix[is_equation], "b_eq": lp.row_lower[is_equation]}
-    inequalities = {"A_ub": -matrix[~is_equation], "b_ub": -lp.row_lower[~is_equation]}
+    equations = {"A_eq": matrix[is_equation], "b_eq": lp.right[is_equation]}
+    inequalities = {"A_ub": -matrix[~is_equation], "b_ub": -lp.right[~is_equation]}
     found = scipy.optimize.linprog(lp.cost, **equations, **inequalities, bounds=bounds)
     value = found.fun / program.unit * (-1.0 if form == "primal" else 1.0)
     assert float(ours.margin) - 1e-7 <= value <= float(ours.margin_bound) + 1e-7
@@ -133,25 +135,115 @@ def test_both_programs_have_the_value_that_lpal_certifies(small, form, shares):
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_the_conic_program_holds_the_same_rows(small, form, rng):
     mdp, expectations = small
-    program = Program(Model.of(mdp), form, True)
-    conic, lp = ConicProgram.of(program), program.given(expectations)
-    q, b = conic.given(expectations)
-    z = rng.random(len(q))
-    slack, rows = b - conic.matrix @ z, lp.matrix @ z - lp.row_lower
-    is_equation = lp.row_lower == lp.row_upper
-    assert conic.num_zero == is_equation.sum()
-    np.testing.assert_allclose(slack[: conic.num_zero], -rows[is_equation], atol=1e-12)
-    np.testing.assert_allclose(slack[conic.num_zero : len(rows)], rows[~is_equation], atol=1e-12)
-    np.testing.assert_allclose(slack[len(rows) :], z[lp.lower == 0.0], atol=1e-12)
+    lp = Lpal(Model.of(mdp), form, True).given(expectations)
+    _check_conic(lp, rng)
 
 
-# ------------------------------------------------------------------------------------------------------------- limits
+def _check_conic(lp, rng):
+    conic, z = Conic(lp), rng.random(len(lp.cost))
+    slack, rows = conic.right(lp) - conic.matrix @ z, lp.matrix @ z - lp.right
+    fixed, equations = np.split(slack[: conic.num_zero], [(lp.upper == 0.0).sum()])
+    np.testing.assert_allclose(fixed, -z[lp.upper == 0.0], atol=1e-12)
+    np.testing.assert_allclose(equations, -rows[lp.is_equation], atol=1e-12)
+    inequalities, bounds = np.split(slack[conic.num_zero :], [(~lp.is_equation).sum()])
+    np.testing.assert_allclose(inequalities, rows[~lp.is_equation], atol=1e-12)
+    np.testing.assert_allclose(bounds, z[(lp.lower == 0.0) & (lp.upper > 0.0)], atol=1e-12)
 
 
-def test_a_process_is_ended_at_its_limit():
+def random_pairs(rng, count, n, m):
+    return [(rng.dirichlet(np.ones(n), (n, 2)), rng.dirichlet(np.ones(m), (m, 2))) for _ in range(count)]
+
+
+@pytest.mark.parametrize("anchored", [True, False])
+def test_a_homomorphisms_program_is_what_the_pair_says(anchored, rng):
+    """Rows against einsum, for another pair than the one that the program was made from."""
+    one, (source, target) = random_pairs(rng, 2, 3, 4)
+    lp = Homomorphisms(*one, anchored).given((source, target))
+    f, e = rng.dirichlet(np.ones(4), 3), 0.3
+    error = np.einsum("iaj,jk->iak", source, f) - np.einsum("il,lak->iak", f, target)
+    expected = np.concatenate([f.sum(axis=1), e - error.ravel(), e + error.ravel()])
+    np.testing.assert_allclose(lp.matrix @ np.append(f.ravel(), e), expected, atol=1e-12)
+    assert np.flatnonzero(lp.upper == 0.0).tolist() == ([1, 2, 3] if anchored else [])
+    assert lp.is_equation.sum() == 3 and not lp.lower.any()
+    _check_conic(lp, rng)
+
+
+# -------------------------------------------------------------------------------------------------------------- peers
+
+
+@pytest.mark.parametrize("method", lp_peers.PEERS)
+def test_every_peer_solves_what_it_is_given(method, small, rng):
+    """LPAL for two expectations in a row and an LP (9) for two pairs, against SciPy and our own bounds."""
+    if not lp_peers.is_installed(method):
+        pytest.skip("not installed")
+    mdp, expectations = small
+    options = {"threads": 1, "limit": 60.0}
+    for programs, lanes in (
+        (Lpal(Model.of(mdp), "dual", True), [expectations, 0.9 * expectations]),
+        (None, random_pairs(rng, 2, 3, 3)),
+    ):
+        settings = Settings(1e-7, {"sparse": False} if method == "mpax" else {})
+        programs = programs or Homomorphisms(*lanes[0], anchored=True)
+        peer = lp_peers.PEERS[method][1](settings, **options)
+        for lane in lanes:
+            lp = programs.given(lane)
+            peer.load([lp])
+            ((z, multipliers, _),) = peer.solve(60.0)
+            assert lp.cost @ z == pytest.approx(_value(lp), abs=1e-5)
+            assert multipliers @ lp.right == pytest.approx(_value(lp), abs=1e-5)  # strong duality
+
+
+def _value(lp):
+    rows, right, equation = lp.matrix.toarray(), lp.right, lp.is_equation
+    bounds = np.stack([lp.lower, lp.upper], axis=1)
+    parts = {"A_eq": rows[equation], "b_eq": right[equation], "A_ub": -rows[~equation], "b_ub": -right[~equation]}
+    return scipy.optimize.linprog(lp.cost, **parts, bounds=bounds).fun
+
+
+# ---------------------------------------------------------------------------------------------------------- processes
+
+
+class Doubling:
+    """Answers twice a lane; as slow as it is told."""
+
+    def __init__(self, seconds, **_):
+        self.seconds = seconds
+
+    def load(self, lanes):
+        self.lanes = lanes
+
+    def solve(self, limit):
+        time.sleep(self.seconds)
+        return [(2 * lane, "done", 1) for lane in self.lanes]
+
+
+@pytest.fixture
+def here(monkeypatch, request):
+    """Processes find this file as `bench.test_speed_report`."""
+    monkeypatch.setitem(__import__("sys").modules, "bench.doubling", __import__(__name__))
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_lanes_come_back_in_order_with_their_times(together, here):
+    groups = [[1, 2, 3]] if together else [[1], [2], [3]]
+    (found,) = processes.run("doubling:Doubling", {"seconds": 0.02}, groups, 10.0, "numpy", 3, False)
+    assert (found.answers, found.words, found.iterations) == ([2, 4, 6], ["done"] * 3, [1] * 3)
+    assert found.seconds == pytest.approx([0.02 / len(groups[0])] * 3, rel=0.5)
+    assert found.build_s < 0.01 and found.processes == 1
+
+
+def test_lanes_that_the_limit_leaves_no_time_for_are_left_out(here):
+    (found,) = processes.run("doubling:Doubling", {"seconds": 0.2}, [[1], [2], [3]], 0.3, "numpy", 0, False)
+    assert found.answers == [2]
+
+
+def test_processes_share_lanes_and_are_ended_at_their_limit():
+    pairs = random_pairs(np.random.default_rng(0), 3, 2, 2)
+    shared = {"method": "numpy solve", "work": "policy_value", "model": None}
+    with pytest.raises(processes.NoAnswer, match="AttributeError"):
+        processes.measure("planning_peers:opened", shared, pairs, 60.0, processes=2)
     start = time.perf_counter()
-    assert limits.start("speed_rows", "matches", {"method": "glop", "wanted": ["gl"]}).result(60.0) is True
-    assert limits.start("test_limits_nothing", "nothing", {}).result(0.0) is None
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(processes.NoAnswer, match="time limit"):
+        patch.setattr(processes, "_START_UP", 0.0)
+        processes.measure("planning_peers:opened", shared, pairs, 0.0)
     assert time.perf_counter() - start < 60.0
-    with pytest.raises(RuntimeError, match="unexpected keyword argument 'wrong'"):
-        limits.start("speed_rows", "matches", {"wrong": 1}).result(60.0)

@@ -11,7 +11,7 @@ from jaxhom import interrupts
 
 interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
 
-from jaxhom.apprenticeship.lpal import LPALSolution, lpal
+from jaxhom.apprenticeship.lpal import LPAL, LPALSolution, lpal
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
@@ -42,6 +42,7 @@ from jaxhom.status import Status
 __version__ = "0.1.0"
 
 __all__ = [
+    "LPAL",
     "MDP",
     "Demonstrations",
     "Evaluation",

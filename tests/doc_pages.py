@@ -112,14 +112,15 @@ def _split(text: str) -> tuple[list[str], list[str]]:
 
 
 def _run_command(line: str) -> None:
-    from bench import reproduce
-    from jaxhom.cli.parser import main
-
     words = shlex.split(line)
     if words[:3] == ["python", "-m", "jaxhom"]:
+        from jaxhom.cli.parser import main
+
         if main(words[3:]):
             raise RuntimeError(f"{line}: failed")
     elif words[:3] == ["python", "-m", "bench.reproduce"]:
+        from bench import reproduce
+
         reproduce.parser().parse_args(words[3:])  # the sweeps take minutes: their own tests run them
     elif words and words != ["python", "-m", "bench.report"]:
         _require_installs(line)

@@ -1,4 +1,13 @@
-"""The games over the columns of LPAL: some at a time, padded to a common number of columns."""
+"""The games over the columns of LPAL: some at a time, padded to a common number of columns.
+
+Each is a zero-sum matrix game with a row per feature and a column V(pi) - Vhat per policy
+(`jaxhom.solvers.game_interior_point`); games that are large on both sides go to PDHG (`jaxhom.solvers.game_pdhg`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +18,10 @@ from jaxhom.solvers.game_interior_point import GameSolution, solve_game
 from jaxhom.solvers.game_pdhg import MatrixGame
 from jaxhom.solvers.programs import host_jit
 
-_FIRST_CAPACITY = 32
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float
+
+_FIRST_CAPACITY = 32  # columns that every program has room for, so that small games share one
 _MAX_NEWTON_SIZE = 256  # strategies of the player who has fewer; the normal matrix of a step is that large
 _PDHG_ITERATIONS = 4096  # an inexact game still gives valid weights
 
@@ -23,7 +35,14 @@ def capacities(num_features: int) -> list[int]:
     return sorted({max(_FIRST_CAPACITY, times * enough) for times in (0, 2, 4)})
 
 
-def play(payoffs: list[np.ndarray], former, bounds, tolerance, share: float, width: int) -> GameSolution:
+def play(
+    payoffs: Sequence[Float[np.ndarray, "K m"]],
+    former: Sequence[tuple[Float[ArrayLike, "*K"], Float[np.ndarray, " m"]]],
+    bounds: Sequence[float],
+    tolerance: Float[ArrayLike, "*games"],
+    share: float,
+    width: int,
+) -> GameSolution:
     """Solves games, loosely where much is open.
 
     Args:

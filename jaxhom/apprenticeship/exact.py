@@ -15,6 +15,10 @@ Where a guess is too rough, it is replaced by the solution of the linear system:
 graph like a road or a grid, otherwise by BiCGSTAB; values by steps of policy iteration.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
@@ -22,12 +26,16 @@ import scipy.sparse.linalg
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.host_chains import host_model
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+NEAR_ONE = 0.998  # a discount above which linear systems are better solved on the host
 _EPS = np.finfo(np.float64).eps
 _DIRECT = 4e6  # states times bandwidth, up to which LU is quick
 _ENOUGH = 0.05  # share of the tolerance that errors may take without another attempt
 _ROUNDINGS = 16.0  # by which a row may miss 1 before that is looked at
-_MAX_IMPROVEMENTS = 200
-_MAX_KRYLOV_STEPS, _KRYLOV_RESIDUAL = 500, 1e-13
+_MAX_IMPROVEMENTS = 200  # of policy iteration; the bound holds wherever it stops
+_MAX_KRYLOV_STEPS, _KRYLOV_RESIDUAL = 500, 1e-13  # to what float64 can give; what is missing widens the bound
 
 
 class Exact:
@@ -40,7 +48,7 @@ class Exact:
       allowed: bool [S, A].
     """
 
-    def __init__(self, mdp: MDP, total: np.ndarray | None = None):
+    def __init__(self, mdp: MDP, total: Float[np.ndarray, " S*A"] | None = None):
         """`total` [S A]: what rows of probabilities sum to; 1 if None."""
         self.model, self.allowed = host_model(mdp), np.asarray(mdp.allowed)
         self._mdp, self._is_given = mdp, total is not None
@@ -65,7 +73,7 @@ class Exact:
         else:
             self._out, self._in = rows.shape[1], rows.shape[0]
 
-    def as_stored(self) -> "Exact | None":
+    def as_stored(self) -> Exact | None:
         """The model with its rows as they are stored; None if they sum to 1 in float64, up to some roundings."""
         total = np.asarray(self._mdp.probability).sum(axis=-1, dtype=np.float64).ravel()
         is_off = np.abs(total - 1.0)[self.allowed.ravel()].max() > _ROUNDINGS * _EPS
@@ -76,7 +84,9 @@ class Exact:
         """Whether linear systems are solved by LU, whatever the discount."""
         return self.model.is_narrow or self.model.num_states * self.model.bandwidth <= _DIRECT
 
-    def expectations(self, policy: np.ndarray, guess: np.ndarray | None, tolerance: float):
+    def expectations(
+        self, policy: Float[np.ndarray, "S A"], guess: Float[np.ndarray, " S"] | None, tolerance: float
+    ) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
         """The occupancy of the states, feature expectations, and what these may be off by.
 
         Args:
@@ -108,7 +118,13 @@ class Exact:
         rounding = (len(visits) + 8) * _EPS * (visits @ np.abs(self.features))
         return mu, expected, missing * self.size * self._most + rounding
 
-    def plan(self, weights: np.ndarray, value: np.ndarray | None, actions: np.ndarray | None, tolerance: float):
+    def plan(
+        self,
+        weights: Float[np.ndarray, " K"],
+        value: Float[np.ndarray, " S"] | None,
+        actions: Int[np.ndarray, " S"] | None,
+        tolerance: float,
+    ) -> tuple[float, Float[np.ndarray, " S"], Int[np.ndarray, " S"]]:
         """The best policy for the reward w . phi.
 
         Args:
@@ -201,7 +217,9 @@ def _solve_directly(matrix, discount: float, right: np.ndarray) -> np.ndarray:
     return np.linalg.solve(np.eye(len(right)) - discount * matrix, right)
 
 
-def compact_features(features: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+def compact_features(
+    features: Float[np.ndarray, "S A K"], allowed: Bool[np.ndarray, "S A"]
+) -> Float[np.ndarray, "S A|1 K"]:
     """Features [S, A, K] as [S, 1, K] where they are the same for all allowed actions."""
     if allowed.all():
         some = features[:, :1]
@@ -212,7 +230,7 @@ def compact_features(features: np.ndarray, allowed: np.ndarray) -> np.ndarray:
     return features if depends else some
 
 
-def exact_rows(policy: np.ndarray, dtype) -> np.ndarray:
+def exact_rows(policy: Float[np.ndarray, "*B S A"], dtype: np.dtype | type) -> Float[np.ndarray, "*B S A"]:
     """A policy [..., S, A] in numbers of the given type whose rows sum to exactly 1, in any order of the sum.
 
     At a discount of 0.99999 a row that misses 1 by a rounding of float32 would move expectations by a hundredth. The
@@ -226,7 +244,7 @@ def exact_rows(policy: np.ndarray, dtype) -> np.ndarray:
     return (steps / count).astype(dtype)
 
 
-def rounded_down(number: float, dtype) -> np.ndarray:
+def rounded_down(number: float, dtype: np.dtype | type) -> Float[np.ndarray, ""]:
     """The largest number of the type that is not above the given one."""
     number = np.float64(number)
     with np.errstate(over="ignore"):

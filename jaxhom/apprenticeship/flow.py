@@ -8,7 +8,9 @@ shares nothing with the columns but the certificate. Every few hundred iteration
 (eq. 5) and their true margins computed, the weights are bounded by planning, and the loop ends when those two meet.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -16,65 +18,62 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom import checks
-from jaxhom.apprenticeship.certificate import (
-    Found,
-    LPALSolution,
-    UpperBound,
-    better_bound,
-    bound_by_planning,
-)
 from jaxhom.apprenticeship.flow_factor import factor_flow
 from jaxhom.apprenticeship.flow_lp import FlowProblem
+from jaxhom.apprenticeship.planning_bound import UpperBound, better_bound, bound_by_planning
+from jaxhom.apprenticeship.request import Request
+from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
 from jaxhom.solvers import pdhg
 from jaxhom.status import Status
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
 DEFAULT_ITERATIONS = 20_000
-_STEPS_PER_LOOK = 16  # of pdhg.STEPS_PER_CHECK iterations each
-_LOOKS_PER_CERTIFICATE = 8
-_FIRST_WEIGHT = 0.1
+_STEPS_PER_LOOK = 16  # of pdhg.STEPS_PER_CHECK iterations each: a look solves seven linear systems per lane
+_LOOKS_PER_CERTIFICATE = 8  # looks nearly always say the same
+_FIRST_WEIGHT = 0.1  # the primal weight to begin with; the engine moves it from there
 _WEIGHT_RANGE = (0.01, 3.0)  # times the ratio of the dual to the primal point's length
 # An action that loses more than this share of the largest reward is left out of a policy.
 _CLEAR_LOSSES = (float("inf"), 1e-2, 1e-4)
 
 
-def solve_by_flow(
-    mdp: MDP,
-    expectations: np.ndarray,
-    initial_policy: np.ndarray | None,
-    tolerance: np.ndarray,
-    certify: Callable[[Found], LPALSolution],
-    *,
-    max_iterations: int | None = None,
-    progress: bool = False,
-) -> LPALSolution:
-    """`lpal` on a batch: expectations [B, K], initial_policy [B, S, A] or None."""
-    limit = DEFAULT_ITERATIONS if max_iterations is None else max_iterations
-    expectations, tolerance = checks.to_device(expectations, mdp.dtype), checks.to_device(tolerance, mdp.dtype)
-    problem = _make_problem(mdp, expectations)
-    first = uniform_policy(mdp) if initial_policy is None else checks.to_device(initial_policy, mdp.dtype)
-    state = _start(problem, jnp.broadcast_to(first, (len(expectations), mdp.num_states, mdp.num_actions)))
+def solve_by_flow(request: Request) -> Found:
+    """All lanes at once. Weights to begin with are not used."""
+    mdp, limit = request.model.mdp, request.limit or DEFAULT_ITERATIONS
+    expectations = checks.to_device(request.expectations, mdp.dtype)
+    tolerance = checks.to_device(request.tolerance, mdp.dtype)
+    problem = request.model.once(FlowProgram).problem(expectations)
+    state = _start(problem, _first_policies(mdp, request.policy, len(expectations)))
     bound = best = None
     value = jnp.zeros((len(expectations), mdp.num_states), mdp.dtype)
     done = looks = 0
-    with tqdm(disable=not progress, desc="LPAL", unit="iteration", total=limit) as bar:
+    with tqdm(disable=not request.progress, desc="LPAL", unit="iteration", total=limit) as bar:
         while True:
             bound, value, solution = _look(problem, expectations, state, bound, value, tolerance, done)
             best = solution if best is None else _better(best, solution, tolerance)
             bar.set_postfix(gap=f"{float((best.margin_bound - best.margin).max()):.2e}")
-            if (best.status == Status.SOLVED).all() or done >= limit:
-                return certify(_found(best))
             looks += 1
-            # The certificate has digits that looks in a short type, or at features far from 0, have not.
-            if looks % (1 if mdp.dtype != jnp.float64 else _LOOKS_PER_CERTIFICATE) == 0:
-                solution = certify(_found(best))
-                if (solution.status == Status.SOLVED).all():
-                    return solution
+            if (best.status == Status.SOLVED).all() or done >= limit or _is_certified(request, best, looks):
+                return _found(best)
             steps = min(_STEPS_PER_LOOK, -(-(limit - done) // pdhg.STEPS_PER_CHECK))
             state = _advance(problem, state, steps)
             done += steps * pdhg.STEPS_PER_CHECK
             bar.update(steps * pdhg.STEPS_PER_CHECK)
+
+
+def _first_policies(mdp: MDP, policies: np.ndarray | None, lanes: int) -> jax.Array:
+    first = uniform_policy(mdp) if policies is None else checks.to_device(policies, mdp.dtype)
+    return jnp.broadcast_to(first, (lanes, mdp.num_states, mdp.num_actions))
+
+
+def _is_certified(request: Request, best: LPALSolution, looks: int) -> bool:
+    """Now and then: the certificate has digits that looks in a short type, or at features far from 0, have not."""
+    if looks % (1 if request.model.mdp.dtype != jnp.float64 else _LOOKS_PER_CERTIFICATE):
+        return False
+    return bool((request.certified(_found(best)).status == Status.SOLVED).all())
 
 
 def _found(best: LPALSolution) -> Found:
@@ -83,21 +82,27 @@ def _found(best: LPALSolution) -> Found:
     return Found(x=host.policy, weights=host.weights, iterations=host.iterations, stopped=stopped, negligible=0.0)
 
 
-def _make_problem(mdp: MDP, expectations: jax.Array) -> FlowProblem:
-    features = np.asarray(mdp.features, np.float64)
-    unit = _units(np.abs(features).max(axis=(0, 1)))
-    scaled = features / unit
-    projection = factor_flow(mdp, scaled)
-    if (features == features[:, :1]).all():
-        scaled = scaled[:, :1]
-    expected = (1.0 - mdp.discount) / jnp.asarray(unit, mdp.dtype)[:, None] * expectations.T
-    return FlowProblem(
-        mdp=mdp,
-        features=checks.to_device(scaled, mdp.dtype),
-        expectations=expected,
-        projection=projection,
-        share=None if (unit == unit[0]).all() else checks.to_device(unit.min() / unit, mdp.dtype),
-    )
+class FlowProgram:
+    """The program of a model, for any expectations: features in units of their own, and the factorisation for them."""
+
+    def __init__(self, mdp: MDP):
+        features = np.asarray(mdp.features, np.float64)
+        unit = _units(np.abs(features).max(axis=(0, 1)))
+        scaled = features / unit
+        projection = factor_flow(mdp, scaled)
+        if (features == features[:, :1]).all():
+            scaled = scaled[:, :1]
+        self._per_expectation = (1.0 - mdp.discount) / jnp.asarray(unit, mdp.dtype)[:, None]
+        self._fields = {
+            "mdp": mdp,
+            "features": checks.to_device(scaled, mdp.dtype),
+            "projection": projection,
+            "share": None if (unit == unit[0]).all() else checks.to_device(unit.min() / unit, mdp.dtype),
+        }
+
+    def problem(self, expectations: Float[Array, "B K"]) -> FlowProblem:
+        """For a batch of expectations in the units of the model's features."""
+        return FlowProblem(expectations=self._per_expectation * expectations.T, **self._fields)
 
 
 def _units(size: np.ndarray) -> np.ndarray:

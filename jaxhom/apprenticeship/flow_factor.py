@@ -1,5 +1,9 @@
 """The factorisation behind the flow method, made once on the host: (M M^T)^-1 for `FlowProjection`."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
@@ -10,11 +14,14 @@ from jaxhom.models.mdp import MDP
 from jaxhom.planning.flow_matrix import flow_matrix
 from jaxhom.solvers.block_tridiagonal import BlockCholesky, order_in_blocks
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 _REGULARISATIONS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)  # shares of the diagonal, to be tried in turn
 _MAX_ENTRIES = 2**28  # of the factor: 2 GB in float64
 
 
-def factor_flow(mdp: MDP, features: np.ndarray) -> FlowProjection:
+def factor_flow(mdp: MDP, features: Float[np.ndarray, "S A K"]) -> FlowProjection:
     """Factorises the rows of the affine set.
 
     Args:

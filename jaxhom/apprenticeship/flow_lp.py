@@ -15,18 +15,24 @@ c_i / min c, and the simplex is sum_i q_i min c / c_i = s. Pairs that are not al
 primal point is lambda and q stacked, [S A + K, lanes], the dual one x and u.
 """
 
-import chex
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 
 from jaxhom.models.mdp import MDP, expected_next_values, push_forward
 from jaxhom.solvers.projections import project_simplex
+from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float, Int
 
 FEATURE_SCALE = 3.0  # s: a step moves weights by 1 / s^2 of what it moves multipliers of x >= 0
 
 
-@chex.dataclass(frozen=True)
-class FlowProjection:
+class FlowProjection(Record):
     """(M M^T)^-1 of the rows M = [F, 0; Phi^T, -s] of the affine set, by blocks, for products with many lanes.
 
     F F^T is block tridiagonal in a suitable order of the states, with nb blocks of n (one block: dense). The K feature
@@ -41,14 +47,16 @@ class FlowProjection:
       schur: [K, K], inverse of the feature rows' Schur complement.
     """
 
-    order: jax.Array
-    place: jax.Array
-    lower: jax.Array
-    diagonal: jax.Array
-    behind: jax.Array
-    schur: jax.Array
+    order: Int[Array, " nb*n"]
+    place: Int[Array, " S"]
+    lower: Float[Array, "nb n n"]
+    diagonal: Float[Array, "nb n n"]
+    behind: Float[Array, "S K"]
+    schur: Float[Array, "K K"]
 
-    def solve(self, flow: jax.Array, expected: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def solve(
+        self, flow: Float[Array, "S lanes"], expected: Float[Array, "K lanes"]
+    ) -> tuple[Float[Array, "S lanes"], Float[Array, "K lanes"]]:
         """(M M^T)^-1 of a right-hand side [S, lanes], [K, lanes]."""
         on_features = self.schur @ (expected - self.behind.T @ flow)
         return self._solve_flow(flow) - self.behind @ on_features, on_features
@@ -77,8 +85,7 @@ class FlowProjection:
         return solution.reshape(count * size, -1)[self.place]
 
 
-@chex.dataclass(frozen=True)
-class FlowProblem:
+class FlowProblem(Record):
     """A batch of programs over one model.
 
     Attributes:
@@ -90,10 +97,10 @@ class FlowProblem:
     """
 
     mdp: MDP
-    features: jax.Array
-    expectations: jax.Array
+    features: Float[Array, "S A|1 K"]
+    expectations: Float[Array, "K lanes"]
     projection: FlowProjection
-    share: jax.Array | None = None
+    share: Float[Array, " K"] | None = None
 
     def start(self) -> tuple[jax.Array, jax.Array]:
         """No multipliers, uniform weights; the point of the affine set next to the uniform x."""
@@ -179,7 +186,9 @@ class FlowProblem:
         return jnp.tensordot(self.features, x, axes=((0, 1), (0, 1)))
 
 
-def project_weighted_simplex(point: jax.Array, share: jax.Array, total: float) -> jax.Array:
+def project_weighted_simplex(
+    point: Float[Array, "K lanes"], share: Float[Array, " K"], total: float
+) -> Float[Array, "K lanes"]:
     """argmin_q |q - point|^2 subject to q >= 0, share . q = total; [K, lanes], share [K] positive.
 
     q = max(point - t share, 0), with t found from the values of t at which entries become 0.

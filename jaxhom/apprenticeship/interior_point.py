@@ -8,22 +8,29 @@ bound. Pairs that are not allowed have no variable. Made for models whose graph 
 this takes 5-40 steps.
 """
 
+from __future__ import annotations
+
 import dataclasses
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
 from tqdm import tqdm
 
-from jaxhom.apprenticeship.certificate import Found, LPALSolution, simplex_point
+from jaxhom.apprenticeship.certificate import simplex_point
+from jaxhom.apprenticeship.request import Request
+from jaxhom.apprenticeship.solution import Found
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.flow_matrix import flow_matrix
 from jaxhom.solvers.normal_equations import Rows
 from jaxhom.solvers.sparse_interior_point import solve
 from jaxhom.status import Status
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 DEFAULT_STEPS = 100
-_MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals
+_MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals: certificates are made of what is left
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,9 +42,9 @@ class Point:
       steps: taken. status: SOLVED by its own account, or why it ended.
     """
 
-    x: np.ndarray
-    weights: np.ndarray
-    value: np.ndarray
+    x: Float[np.ndarray, "S A"]
+    weights: Float[np.ndarray, " K"]
+    value: Float[np.ndarray, " S"]
     steps: int
     status: Status
 
@@ -64,44 +71,28 @@ class Program:
         self._cost, self._initial = np.zeros(matrix.shape[1]), np.asarray(mdp.initial, float)
         self.work = self._rows.work
 
-    def solve(self, expectations: np.ndarray, tolerance: float, **options) -> Point:
-        """One lane: expectations [K], and options of `sparse_interior_point.solve`."""
+    def solve(
+        self, expectations: Float[np.ndarray, " K"], tolerance: float, *, max_iterations: int = DEFAULT_STEPS
+    ) -> Point:
+        """One lane, to a gap of the tolerance if all goes well."""
         right = np.concatenate([self._initial, expectations / self._unit])
         tolerance *= _MARGIN_SHARE
-        point = solve(self._rows, self._cost, np.array([-1.0]), right, tolerance=tolerance, **options)
+        point = solve(
+            self._rows, self._cost, np.array([-1.0]), right, tolerance=tolerance, max_iterations=max_iterations
+        )
         num_states, x = self._shape[0], np.zeros(self._shape)
         x.ravel()[self._pairs] = point.z[: len(self._pairs)]
         weights = simplex_point(point.y[num_states:] / self._unit)
         return Point(x, weights, -point.y[:num_states], point.steps, point.status)
 
 
-def solve_by_interior_point(
-    mdp: MDP,
-    expectations: np.ndarray,
-    initial_policy,
-    tolerance: np.ndarray,
-    certify: Callable[[Found], LPALSolution],
-    *,
-    max_iterations: int | None = None,
-    progress: bool = False,
-    program: Program | None = None,
-) -> LPALSolution:
-    """`lpal` on a batch: expectations [B, K]. An interior method starts in the middle: `initial_policy` is not used.
-
-    `program` is that of the model, where it is there.
-    """
-    del initial_policy
-    program, limit = program or Program(mdp), DEFAULT_STEPS if max_iterations is None else max_iterations
-    lanes = tqdm(np.asarray(expectations, float), desc="LPAL", unit="lane", disable=not progress)
-    points = [program.solve(lane, goal, max_iterations=limit) for lane, goal in zip(lanes, tolerance, strict=True)]
+def solve_by_interior_point(request: Request) -> Found:
+    """An interior method starts in the middle of what is feasible: what there is to begin with is not used."""
+    program, limit = request.model.once(Program), request.limit or DEFAULT_STEPS
+    lanes = zip(request.expectations, request.tolerance, strict=True)
+    bar = tqdm(lanes, desc="LPAL", unit="lane", total=len(request.lanes), disable=not request.progress)
+    points = [program.solve(expectations, goal, max_iterations=limit) for expectations, goal in bar]
     x, weights, value = (np.stack([getattr(point, name) for point in points]) for name in ("x", "weights", "value"))
     stopped = [Status.ITERATION_LIMIT if point.status == Status.ITERATION_LIMIT else Status.STALLED for point in points]
-    return certify(
-        Found(
-            x=x,
-            weights=weights,
-            value=value,
-            iterations=np.array([point.steps for point in points]),
-            stopped=np.array(stopped),
-        )
-    )
+    steps = np.array([point.steps for point in points])
+    return Found(x=x, weights=weights, value=value, iterations=steps, stopped=np.array(stopped))

@@ -7,30 +7,40 @@ Given expectations Vhat of the expert's features, find the policy with the large
 (Boularias and Chaib-draa 2010, eqs. 2-5). Rewards are non-negative combinations of the features, so a policy of
 margin v is worth at least the expert's value plus v times the sum of the weights.
 
-`columns` plays the game over policies, `flow` runs PDHG on the linear program itself (`flow_factor` prepares its
-projection on the flow), `interior_point` a sparse interior-point method on the same, and `quickest` chooses; all end in
-`certificate`, which computes the true margin of the policy that is returned and the best upper bound. `presolve` takes
-out what no policy can reach, `sensitivity` gives the margin its derivatives.
+A call is checked, presolved (`presolve` takes out what no policy can reach) and handed to a method as a `Request`; what
+the method has found is certified: `certificate` computes the true margin of the policy that is returned and the best
+upper bound; and `sensitivity` gives the margin its derivatives. A method is a function from `Request` to `Found`, and
+a line of `_METHODS`. `columns` plays the game over policies, `flow` runs PDHG on the linear program itself,
+`interior_point` a sparse interior-point method on the same, and `quickest` chooses.
 """
 
-import dataclasses
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.certificate import Certifier, LPALSolution
+from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.columns import solve_by_columns
 from jaxhom.apprenticeship.flow import solve_by_flow
 from jaxhom.apprenticeship.interior_point import solve_by_interior_point
+from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectations
 from jaxhom.apprenticeship.quickest import solve_by_the_quickest
+from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.sensitivity import with_derivatives, without_tangents
+from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP
 
-_METHODS = {
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float
+
+_METHODS: dict[str, Callable[[Request], Found]] = {
     "auto": solve_by_the_quickest,
     "columns": solve_by_columns,
     "flow": solve_by_flow,
@@ -40,21 +50,23 @@ _METHODS = {
 _LARGEST = 2.0**-20  # share of the largest number of a type: what sums of expectations may need stays within it
 _FLOAT32_GOAL = 0.5  # share of the tolerance that methods aim for: the rest is for what the model's rounding hides
 
-__all__ = ["LPALSolution", "lpal"]
+__all__ = ["LPAL", "LPALSolution", "lpal"]
 
 
 def lpal(
     mdp: MDP,
-    expectations: jax.Array,
+    expectations: Float[ArrayLike, "*B K"],
     *,
-    initial_policy: jax.Array | None = None,
+    initial_policy: Float[ArrayLike, "*B S A"] | None = None,
     warm_start: LPALSolution | None = None,
-    tolerance: float | None = None,
+    tolerance: float | Float[ArrayLike, " B"] | None = None,
     method: str = "auto",
     max_iterations: int | None = None,
     progress: bool = False,
 ) -> LPALSolution:
     """Finds the policy whose feature expectations exceed the given ones by the largest margin.
+
+    It solves max_pi min_i V_i(pi) - expectations_i over all stationary policies.
 
     Args:
       mdp: the model, with K >= 1 features.
@@ -80,9 +92,11 @@ def lpal(
       `LPALSolution`, with a leading axis [B] if the expectations have one. Its bounds hold whatever the status: they
       are computed in float64 from the policy and the weights that are returned, rounding included. STALLED says that
       rounding keeps them further apart than the tolerance.
-      Under `jax.grad` and `jax.jvp`, but not under jit or vmap, `margin` and `margin_bound` have the derivative of the
-      best margin with respect to expectations and to the model's probability, initial, features and discount
-      (`jaxhom.apprenticeship.sensitivity`). Policy, occupancy and weights are constants there.
+
+    Works on the host: not under `jit` or `vmap`, for which expectations come in batches. Under `jax.grad` and
+    `jax.jvp`, `margin` and `margin_bound` have the derivative of the best margin with respect to expectations and to
+    the model's probability, initial, features and discount (`jaxhom.apprenticeship.sensitivity`); policy, occupancy
+    and weights are constants there.
 
     Raises:
       ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
@@ -91,76 +105,152 @@ def lpal(
         vmap; on second derivatives.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
+
+    Example:
+      >>> import jaxhom
+      >>> mdp = jaxhom.gridworld(4, num_regions=4).mdp
+      >>> expert = jaxhom.optimal_policy(mdp, mdp.features @ [0.0, 0.0, 0.0, 1.0])
+      >>> solution = jaxhom.lpal(mdp, jaxhom.feature_expectations(mdp, expert.policy), tolerance=0.01)
+      >>> print(bool(solution.margin_bound - solution.margin <= 0.01))
+      True
     """
-    if not isinstance(method, str) or method not in _METHODS:
-        raise ValueError(f"method must be one of {tuple(_METHODS)}, got {method!r}")
-    mdp = as_model(mdp)
-    if not mdp.num_features:
-        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
-    inputs = (mdp, expectations)
-    mdp, expectations, initial_policy, warm_start = without_tangents((mdp, expectations, initial_policy, warm_start))
-    if checks.is_traced(mdp, expectations, initial_policy, warm_start):
-        raise ValueError("lpal adds columns on the host: call it outside jit and vmap, in batches [B, K]")
-    host = _checked_expectations(mdp, expectations)
-    batch = np.atleast_2d(host).astype(np.float64)
-    options = {"progress": progress}
-    if max_iterations is not None:
-        options["max_iterations"] = checks.require_count("max_iterations", max_iterations)
-    if warm_start is not None:
-        _require_solution(warm_start)
-        if initial_policy is None:
-            initial_policy = warm_start.policy
-        if method in ("auto", "columns"):
-            options["initial_weights"] = _guess("warm_start.weights", warm_start.weights, batch)
-    if initial_policy is not None:
-        initial_policy = _guess("initial_policy", check_policy(mdp, initial_policy, "initial_policy"), batch)
-    solution = _solve(mdp, batch, initial_policy, tolerance, _METHODS[method], options)
-    if checks.is_traced(inputs):
-        mdp, expectations = inputs
-        solution = with_derivatives(solution, mdp, jnp.atleast_2d(jnp.asarray(expectations, mdp.dtype)))
-    return solution if host.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], solution)
+    _check_method(method)
+    options = {"tolerance": tolerance, "method": method, "max_iterations": max_iterations, "progress": progress}
+    return LPAL(mdp).solve(expectations, initial_policy=initial_policy, warm_start=warm_start, **options)
 
 
-def _solve(mdp: MDP, expectations: np.ndarray, initial_policy, tolerance, method, options: dict) -> LPALSolution:
-    """A batch [B, K], in units in which features are about 1 and expectations within reach."""
-    reduction = reduce_expectations(mdp, expectations)
+class LPAL:
+    """LPAL on a prepared model: many calls over it share what does not depend on the expectations.
+
+    `LPAL(mdp).solve(...)` returns what `lpal(mdp, ...)` returns, to the bit. What a method prepares (a factorisation, a
+    sparse program) is made when a call first needs it and kept as long as the handle. One call at a time: the handle is
+    not for several threads.
+
+    Args:
+      mdp: the model, with K >= 1 features; as in `lpal`, not under `jit` or `vmap`, but under `grad`.
+
+    Raises:
+      ValueError: if the model has no features, or features so large that their sums over time overflow.
+
+    Example:
+      >>> import jaxhom
+      >>> mdp = jaxhom.gridworld(4, num_regions=4).mdp
+      >>> prepared = jaxhom.LPAL(mdp)
+      >>> margins = [float(prepared.solve([vhat] * 4).margin) for vhat in (0.0, 10.0)]
+      >>> print(margins[0] - margins[1])
+      10.0
+    """
+
+    def __init__(self, mdp: MDP):
+        self._mdp = as_model(mdp)
+        if not mdp.num_features:
+            raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+        concrete = without_tangents(self._mdp)
+        _refuse_traced(concrete)
+        _check_features(concrete)
+        self._model = PreparedModel(concrete)
+
+    def __repr__(self) -> str:
+        return f"LPAL({self._mdp!r})"
+
+    def solve(
+        self,
+        expectations: Float[ArrayLike, "*B K"],
+        *,
+        initial_policy: Float[ArrayLike, "*B S A"] | None = None,
+        warm_start: LPALSolution | None = None,
+        tolerance: float | Float[ArrayLike, " B"] | None = None,
+        method: str = "auto",
+        max_iterations: int | None = None,
+        progress: bool = False,
+    ) -> LPALSolution:
+        """`lpal` on the prepared model; see there for arguments, results and errors."""
+        _check_method(method)
+        given = expectations
+        expectations, initial_policy, warm_start = without_tangents((expectations, initial_policy, warm_start))
+        _refuse_traced(expectations, initial_policy, warm_start)
+        host = _checked_expectations(self._model.given, expectations)
+        batch = np.atleast_2d(host).astype(np.float64)
+        policy, weights = _checked_start(self._model.given, batch, initial_policy, warm_start)
+        if max_iterations is not None:
+            max_iterations = checks.require_count("max_iterations", max_iterations)
+        request = _presolved(self._model, batch, tolerance)
+        request = request.replace(policy=policy, weights=weights, limit=max_iterations, progress=progress)
+        solution = jax.tree.map(checks.to_device, request.certified(_METHODS[method](request)))
+        if checks.is_traced(self._mdp, given):
+            given = jnp.atleast_2d(jnp.asarray(given, self._mdp.dtype))
+            solution = with_derivatives(solution, self._mdp, given)
+        return solution if host.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], solution)
+
+
+def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tolerance) -> Request:
+    """The request for a batch: in units in which features are about 1, and expectations within reach."""
+    reduction = reduce_expectations(model.reach, expectations)
     if tolerance is None:
-        tolerance = default_tolerance(mdp, reduction)
+        tolerance = default_tolerance(model.reach, reduction)
     else:
         checks.require_positive("tolerance", tolerance)
     tolerance = np.broadcast_to(np.asarray(tolerance, np.float64), len(expectations))
-    features = np.asarray(mdp.features)
-    unit = float(np.exp2(np.floor(np.log2(np.abs(features).max() or 1.0))))  # a power of two changes no digit
-    certify = Certifier(mdp, expectations, tolerance, reduction, unit)
-    scaled = mdp
-    if unit != 1.0:
-        scaled = dataclasses.replace(mdp, features=checks.to_device(features / features.dtype.type(unit)))
-    goal = tolerance / unit if mdp.dtype == jnp.float64 else _FLOAT32_GOAL * tolerance / unit
-    found = method(scaled, reduction.expectations / unit, initial_policy, goal, certify, **options)
-    return jax.tree.map(checks.to_device, found)
+    share = 1.0 if model.given.dtype == jnp.float64 else _FLOAT32_GOAL
+    return Request(
+        model=model,
+        expectations=reduction.expectations / model.unit,
+        tolerance=share * tolerance / model.unit,
+        certifier=Certifier(model.sides, expectations, tolerance, reduction, model.unit),
+        lanes=np.arange(len(expectations)),
+    )
 
 
-def _checked_expectations(mdp: MDP, expectations) -> np.ndarray:
-    """Expectations [K] or [B, K]; together with the features small enough for sums over time in the model's type."""
+# ------------------------------------------------------------------------------------------------------------- checks
+
+
+def _check_method(method: str) -> None:
+    if not isinstance(method, str) or method not in _METHODS:
+        raise ValueError(f"method must be one of {tuple(_METHODS)}, got {method!r}")
+
+
+def _refuse_traced(*trees) -> None:
+    if checks.is_traced(*trees):
+        raise ValueError("lpal adds columns on the host: call it outside jit and vmap, in batches [B, K]")
+
+
+def _check_features(mdp: MDP) -> None:
+    """Small enough for sums over time in the model's type."""
+    features, largest = np.asarray(mdp.features), _largest(mdp) * (1.0 - float(mdp.discount))
+    if max(features.max(), -features.min()) > largest:
+        message = f"is too large for sums over time in {mdp.dtype} at this discount"
+        checks.require_all("features", features, np.abs(features) <= largest, message)
+
+
+def _checked_expectations(mdp: MDP, expectations) -> Float[np.ndarray, "*B K"]:
+    """Expectations [K] or [B, K], small enough for margins in the model's type."""
     host = checks.as_host_array("expectations", expectations)
     good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features and host.size > 0
     checks.require_shape("expectations", host, f"({mdp.num_features},) or (B, {mdp.num_features})", good)
     host = checks.require_floats("expectations", host)
-    largest, message = _LARGEST * float(np.finfo(mdp.dtype).max), f"is too large for margins in {mdp.dtype}"
-    checks.require_all("expectations", host, np.abs(host) <= largest, message)
-    features, largest = np.asarray(mdp.features), largest * (1.0 - float(mdp.discount))
-    if max(features.max(), -features.min()) > largest:
-        message = f"is too large for sums over time in {mdp.dtype} at this discount"
-        checks.require_all("features", features, np.abs(features) <= largest, message)
+    checks.require_all("expectations", host, np.abs(host) <= _largest(mdp), f"is too large for margins in {mdp.dtype}")
     return host
 
 
-def _require_solution(warm_start) -> None:
-    if not isinstance(warm_start, LPALSolution):
-        raise ValueError(f"warm_start must be an LPALSolution, got {type(warm_start).__name__}")
+def _largest(mdp: MDP) -> float:
+    return _LARGEST * float(np.finfo(mdp.dtype).max)
 
 
-def _guess(name: str, guess, batch: np.ndarray) -> np.ndarray:
+def _checked_start(mdp: MDP, batch: Float[np.ndarray, "B K"], initial_policy, warm_start):
+    """Policies [B, S, A] and weights [B, K] to begin with, or None."""
+    weights = None
+    if warm_start is not None:
+        if not isinstance(warm_start, LPALSolution):
+            raise ValueError(f"warm_start must be an LPALSolution, got {type(warm_start).__name__}")
+        initial_policy = warm_start.policy if initial_policy is None else initial_policy
+        weights = _for_each_lane("warm_start.weights", warm_start.weights, batch)
+    if initial_policy is not None:
+        policy = check_policy(mdp, initial_policy, "initial_policy")
+        initial_policy = _for_each_lane("initial_policy", policy, batch)
+    return initial_policy, weights
+
+
+def _for_each_lane(name: str, guess, batch: Float[np.ndarray, "B K"]) -> np.ndarray:
     """Distributions [..., n], one for all lanes of the batch or one for each, as [B, ..., n]."""
     guess = checks.as_host_array(name, guess)
     lane_ndim = 1 if name.endswith("weights") else 2

@@ -1,11 +1,19 @@
-"""The policies that LPAL on columns has met, shared by all lanes: what one lane has found may serve another."""
+"""The pool of LPAL on columns: the policies that any lane has met, for all lanes to use."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
 from jaxhom.models.mdp import MDP
 
-_FIRST_SIZE = 64
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float, Int
+
+_FIRST_SIZE = 64  # policies that there is room for; the room doubles when it is full
 
 
 class PolicyPool:
@@ -22,11 +30,16 @@ class PolicyPool:
         self._policies: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
-    def expected(self) -> np.ndarray:
+    def expected(self) -> Float[np.ndarray, "M K"]:
         """Feature expectations [M, K] of the policies so far."""
         return self._expected[: len(self._policies)]
 
-    def add(self, occupancy: np.ndarray, policy: np.ndarray, expected: np.ndarray) -> int:
+    def add(
+        self,
+        occupancy: Float[np.ndarray, " S"],
+        policy: Int[np.ndarray, " S"] | Float[np.ndarray, "S A"],
+        expected: Float[np.ndarray, " K"],
+    ) -> int:
         """Takes a policy, given by actions [S] or probabilities [S, A], with mu [S] and V [K]; returns its number."""
         policy = policy.astype(self._action_dtype) if policy.ndim == 1 else policy
         number = len(self._policies)
@@ -36,7 +49,7 @@ class PolicyPool:
         self._policies.append((occupancy.copy(), policy))
         return number
 
-    def mixture(self, numbers: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+    def mixture(self, numbers: Sequence[int], probabilities: Sequence[float]) -> Float[np.ndarray, "S A"]:
         """The occupancy sum_j q_j x_j [S, A] of policies mixed with the given probabilities."""
         states = np.arange(len(self._policies[0][0]))
         x = np.zeros((len(states), self._num_actions))
@@ -48,6 +61,6 @@ class PolicyPool:
                 x += probability * mu[:, None] * policy
         return x
 
-    def one_hot(self, actions: np.ndarray) -> jax.Array:
+    def one_hot(self, actions: Int[np.ndarray, "*B S"]) -> Float[Array, "*B S A"]:
         """Actions [..., S] as a policy [..., S, A]."""
         return jax.nn.one_hot(actions, self._num_actions, dtype=self._dtype)

@@ -13,18 +13,24 @@ they are.
 The same numbers say how small a gap is: small against what each of the features that may be the smallest can do.
 """
 
-import chex
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxhom.apprenticeship.exact import compact_features
 from jaxhom.models.mdp import MDP
+from jaxhom.status import Record
 
-_GAP = 1e-5  # share of what a feature can do
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+_GAP = 1e-5  # share of what a feature can do: a policy that loses so little is as good
 _SAME = 4.0  # roundings of a feature's size within which two of its values are the same
 
 
-@chex.dataclass(frozen=True)
-class Reduction:
+class Reduction(Record):
     """What was changed, per lane; NumPy, float64.
 
     Attributes:
@@ -36,11 +42,11 @@ class Reduction:
         anything.
     """
 
-    expectations: np.ndarray
-    shift: np.ndarray
-    is_idle: np.ndarray
-    scarcest: np.ndarray
-    least: np.ndarray
+    expectations: Float[np.ndarray, "B K"]
+    shift: Float[np.ndarray, " B"]
+    is_idle: Bool[np.ndarray, "B K"]
+    scarcest: Int[np.ndarray, " B"]
+    least: Float[np.ndarray, " B"]
 
     def weights(self, lane: int, weights: np.ndarray) -> np.ndarray:
         """Weights [K] for the given expectations of a lane from those for the reduced ones.
@@ -57,36 +63,58 @@ class Reduction:
         return kept
 
 
-def reduce_expectations(mdp: MDP, expectations: np.ndarray) -> Reduction:
-    """Reduces expectations [B, K], on the host."""
-    values = _values(mdp)
-    low, high = _reach(mdp, values)
+class Reach(Record):
+    """What the features of policies can be, and do; NumPy, float64.
+
+    Attributes:
+      low, high: [K], the least and the largest discounted sum of each feature, whatever the policy; with the sums of
+        probabilities as they are after rounding, and as they should be.
+      scale: [K], what each feature can do per step; infinite where it is constant.
+      size: scalar, the largest |feature|; 1 if all are 0.
+      discount: scalar.
+    """
+
+    low: Float[np.ndarray, " K"]
+    high: Float[np.ndarray, " K"]
+    scale: Float[np.ndarray, " K"]
+    size: float
+    discount: float
+
+    @classmethod
+    def of(cls, mdp: MDP) -> Reach:
+        """That of a concrete model."""
+        values = _values(mdp)
+        low, high = _sums(mdp, values)
+        same = _SAME * float(np.finfo(mdp.dtype).eps)
+        size, discount = float(np.abs(values).max()) or 1.0, float(mdp.discount)
+        return cls(low=low, high=high, scale=_scales(values, same), size=size, discount=discount)
+
+
+def reduce_expectations(reach: Reach, expectations: Float[np.ndarray, "B K"]) -> Reduction:
+    """Reduces expectations, on the host."""
+    low, high = reach.low, reach.high
     most = (high - expectations).min(axis=1)
     least = (low - expectations).min(axis=1)
     floor = low - most[:, None]
     shift = np.clip(0.0, least, most)
     is_idle = expectations < floor
+    scale = np.where(is_idle, np.inf, reach.scale).min(axis=1)
     return Reduction(
         expectations=np.maximum(expectations, floor) + shift[:, None],
         shift=shift,
         is_idle=is_idle,
         scarcest=(high - expectations).argmin(axis=1),
-        least=_least(values, _SAME * float(np.finfo(mdp.dtype).eps), is_idle),
+        least=np.where(np.isfinite(scale), scale, reach.size),
     )
 
 
-def default_tolerance(mdp: MDP, reduction: Reduction) -> np.ndarray:
-    """[B]: a gap that is small against the least that a feature can do which may be the smallest of its lane.
+def default_tolerance(reach: Reach, reduction: Reduction) -> Float[np.ndarray, " B"]:
+    """A gap that is small against the least that a feature can do which may be the smallest of its lane.
 
     Where features of two scales bind together, the margin is decided in the units of the smaller one. Constant features
     do nothing.
     """
-    return _GAP / (1.0 - float(mdp.discount)) * reduction.least
-
-
-def _least(values: np.ndarray, same: float, is_idle: np.ndarray) -> np.ndarray:
-    scale = np.where(is_idle, np.inf, _scales(values, same)).min(axis=1)
-    return np.where(np.isfinite(scale), scale, np.abs(values).max() or 1.0)
+    return _GAP / (1.0 - reach.discount) * reduction.least
 
 
 def _scales(values: np.ndarray, same: float) -> np.ndarray:
@@ -116,8 +144,8 @@ def _values(mdp: MDP) -> np.ndarray:
     return features.reshape(-1, features.shape[-1])
 
 
-def _reach(mdp: MDP, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """low [K] and high [K]; with the sums of probabilities as they are after rounding, and as they should be."""
+def _sums(mdp: MDP, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest discounted sums, low [K] and high [K], over what rounding leaves open."""
     total = np.asarray(mdp.probability).sum(axis=-1, dtype=np.float64)[np.asarray(mdp.allowed)]
     kept = float(mdp.discount) * np.array([[min(total.min(), 1.0)], [max(total.max(), 1.0)]])
     mass = np.asarray(mdp.initial).sum(dtype=np.float64)

@@ -1,16 +1,23 @@
 """Best responses of LPAL on columns: the policy that is worth most for given weights, and its feature expectations."""
 
+from __future__ import annotations
+
 import dataclasses
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.certificate import bound_by_planning, simplex_point
+from jaxhom.apprenticeship.certificate import simplex_point
 from jaxhom.apprenticeship.exact import Exact, compact_features, exact_rows
+from jaxhom.apprenticeship.planning_bound import bound_by_planning
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.chain_solver import rough_state_occupancy
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
 
 
 def with_compact_features(mdp: MDP) -> MDP:
@@ -20,7 +27,14 @@ def with_compact_features(mdp: MDP) -> MDP:
 
 
 @jax.jit
-def respond(mdp: MDP, expectations, weights, value, accuracy, error) -> dict[str, jax.Array]:
+def respond(
+    mdp: MDP,
+    expectations: Float[Array, "L K"],
+    weights: Float[Array, "L K"],
+    value: Float[Array, "L S"],
+    accuracy: Float[Array, " L"],
+    error: Float[Array, ""],
+) -> dict[str, Array]:
     """The best responses to weights, and the bounds that they prove.
 
     Args:
@@ -47,7 +61,7 @@ def respond(mdp: MDP, expectations, weights, value, accuracy, error) -> dict[str
 
 
 @jax.jit
-def evaluate(mdp: MDP, policy) -> tuple[jax.Array, jax.Array]:
+def evaluate(mdp: MDP, policy: Float[Array, "S A"]) -> tuple[Float[Array, " S"], Float[Array, " K"]]:
     """State occupancy [S] and feature expectations [K] of a policy [S, A]."""
     mu, expected = _expected_features(mdp, policy[None], 0.0)
     return mu[:, 0], expected[0]
@@ -63,7 +77,14 @@ def _expected_features(mdp, policy, error):
     return mu, jnp.einsum("sl,lsa,sak->lk", mu, policy, mdp.features)
 
 
-def respond_on_host(exact: Exact, expectations, weights, value, accuracy: float, error: float) -> dict[str, np.ndarray]:
+def respond_on_host(
+    exact: Exact,
+    expectations: Float[np.ndarray, " K"],
+    weights: Float[np.ndarray, " K"],
+    value: Float[np.ndarray, " S"],
+    accuracy: float,
+    error: float,
+) -> dict[str, np.ndarray]:
     """`respond` for one lane, without its axis, by linear solves in float64: right at any discount, in any type."""
     weights = simplex_point(weights)
     best, value, actions = exact.plan(weights, value, None, accuracy)
@@ -78,7 +99,9 @@ def respond_on_host(exact: Exact, expectations, weights, value, accuracy: float,
     }
 
 
-def evaluate_on_host(exact: Exact, policy: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """`evaluate` likewise."""
+def evaluate_on_host(
+    exact: Exact, policy: Float[np.ndarray, "S A"], error: float
+) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " K"]]:
+    """`evaluate`, on the host likewise."""
     mu, expected, _ = exact.expectations(exact_rows(policy, np.float64), None, error)
     return mu, expected

@@ -16,16 +16,25 @@ unique v* has a kink, and what comes out is the derivative of one of its pieces:
 supergradient. Second derivatives would need those of x, w and V, and are refused.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
 import jax
 import jax.numpy as jnp
 
-from jaxhom.apprenticeship.certificate import LPALSolution
+from jaxhom.apprenticeship.solution import LPALSolution
 from jaxhom.models.mdp import MDP, push_forward
 from jaxhom.planning.optimal import optimal_policy
 from jaxhom.solvers.first_order import first_order_only
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
 
-def without_tangents(tree):
+Tree = TypeVar("Tree")
+
+
+def without_tangents(tree: Tree) -> Tree:
     """The arrays of a pytree as they are under `jax.grad` or `jax.jvp`; under jit and vmap they stay traced."""
 
     def strip(leaf):
@@ -38,7 +47,7 @@ def without_tangents(tree):
     return jax.tree.map(strip, tree)
 
 
-def with_derivatives(solution: LPALSolution, mdp: MDP, expectations: jax.Array) -> LPALSolution:
+def with_derivatives(solution: LPALSolution, mdp: MDP, expectations: Float[Array, "B K"]) -> LPALSolution:
     """The solution with a margin and a bound that JAX can differentiate once, forward or in reverse.
 
     Args:

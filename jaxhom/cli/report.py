@@ -17,7 +17,7 @@ from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem
 from jaxhom.cli.statuses import in_words, remarks, undecided, warn, worst_status
 from jaxhom.cli.tables import format_facts
-from jaxhom.generalization.generalization import Generalization
+from jaxhom.generalization.result import Generalization
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.status import Status, bracket
 

@@ -5,12 +5,18 @@ one another, on grids a band about twice as wide as the grid. Dense blocks make 
 matrix products, the fastest that a CPU does.
 """
 
+from __future__ import annotations
+
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg.lapack
 import scipy.sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 _MIN_BLOCKS = 4  # fewer, and one block is faster
 
@@ -24,8 +30,8 @@ class Blocks:
       size: of a block; the last one is filled up with the identity.
     """
 
-    order: np.ndarray
-    place: np.ndarray
+    order: Int[np.ndarray, " n"]
+    place: Int[np.ndarray, " n"]
     size: int
 
     @property
@@ -39,7 +45,7 @@ class Blocks:
         return float(self.count) * self.size**3
 
 
-def order_in_blocks(pattern, min_size: int = 1) -> Blocks:
+def order_in_blocks(pattern: scipy.sparse.sparray | np.ndarray, min_size: int = 1) -> Blocks:
     """Reverse Cuthill-McKee order of a symmetric sparse matrix [n, n]; one block where its band is not narrow.
 
     Args:
@@ -71,7 +77,7 @@ class BlockCholesky:
       numpy.linalg.LinAlgError: if the matrix is not positive definite in floating point.
     """
 
-    def __init__(self, matrix, blocks: Blocks, regularisation: float = 0.0):
+    def __init__(self, matrix: scipy.sparse.sparray | np.ndarray, blocks: Blocks, regularisation: float = 0.0):
         self.blocks = blocks
         diagonal, self.left = self._cut(matrix)
         corners = np.arange(blocks.size)
@@ -99,17 +105,17 @@ class BlockCholesky:
         diagonal[-1, filling, filling] = 1.0
         return diagonal, left
 
-    def unit_factor(self) -> tuple[np.ndarray, np.ndarray]:
+    def unit_factor(self) -> tuple[Float[np.ndarray, "count size size"], Float[np.ndarray, "count size size"]]:
         """Blocks [count, size, size] left of the unit diagonal of U, and inverses of those of C, in U C U^T = N."""
         left = self.left.copy()
         left[1:] = left[1:] @ self.inverse[:-1]
         return left, self.inverse.transpose(0, 2, 1) @ self.inverse
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
+    def solve(self, right: Float[np.ndarray, "n *q"]) -> Float[np.ndarray, "n *q"]:
         """N^-1 right, for right [n] or [n, q]."""
         return self.solve_upper(self.solve_lower(right))
 
-    def solve_lower(self, right: np.ndarray) -> np.ndarray:
+    def solve_lower(self, right: Float[np.ndarray, "n *q"]) -> Float[np.ndarray, "count size *q"]:
         """L^-1 right in the new order, filled up to whole blocks: [n] -> [count, size], [n, q] -> [count, size, q]."""
         blocks = self.blocks
         padded = np.zeros((blocks.count * blocks.size, *right.shape[1:]))
@@ -120,7 +126,7 @@ class BlockCholesky:
             parts[i] = self.inverse[i] @ known
         return parts
 
-    def solve_upper(self, parts: np.ndarray) -> np.ndarray:
+    def solve_upper(self, parts: Float[np.ndarray, "count size *q"]) -> Float[np.ndarray, "n *q"]:
         """L^-T of what `solve_lower` returns, in the old order."""
         blocks, found = self.blocks, np.empty_like(parts)
         for i in reversed(range(blocks.count)):

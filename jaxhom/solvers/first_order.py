@@ -4,13 +4,18 @@ By the envelope theorem the derivative of an optimal value needs no derivative o
 that. Differentiating such a derivative again would take the point for a constant and return a wrong number.
 """
 
+from __future__ import annotations
+
 import functools
+from typing import TypeVar
 
 import jax
 
+Tree = TypeVar("Tree")
+
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
-def first_order_only(point, inputs, message: str):
+def first_order_only(point: Tree, inputs: object, message: str) -> Tree:
     """The point, which is to be, or to be found from, the inputs in a way that is not differentiated.
 
     Args:

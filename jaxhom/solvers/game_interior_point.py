@@ -15,21 +15,29 @@ Each step is Mehrotra's predictor and corrector (1992). Its normal matrix has a 
 one who has fewer.
 """
 
-import chex
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 
 from jaxhom.solvers.inverse_factor import inverse_factor
+from jaxhom.solvers.predictor_corrector import longest_step, mehrotra_target
+from jaxhom.status import Record
 
-_MAX_STEPS = 60
-_TO_BOUNDARY = 0.99
-_LEAST_CENTRING = 0.02
+if TYPE_CHECKING:
+    from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+_MAX_STEPS = 60  # what is still open then, rounding keeps open; the bounds hold wherever it stops
+_TO_BOUNDARY = 0.99  # of the way: points stay positive
+_LONGEST = 100.0  # of a predictor that nothing stops: a number, not infinity
+_LEAST_CENTRING = 0.02  # of the mean product: a target that all but vanishes leaves the next step no room
 _START = 0.1  # slack beyond the worst outcome, as a share of the largest payoff
 _WARM_START = 0.1  # ... and of a former solution's gap; the share of uniform strategies mixed into it, too
 
 
-@chex.dataclass(frozen=True)
-class GameSolution:
+class GameSolution(Record):
     """Strategies and what they prove.
 
     Attributes:
@@ -38,17 +46,23 @@ class GameSolution:
       steps: int32 scalar.
     """
 
-    w: jax.Array
-    q: jax.Array
-    lower: jax.Array
-    upper: jax.Array
-    steps: jax.Array
+    w: Float[Array, " K"]
+    q: Float[Array, " m"]
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+    steps: Int[Array, ""]
 
 
 def solve_game(
-    payoff: jax.Array, is_column: jax.Array, *, tolerance, share=0.0, bound=None, start=None
+    payoff: Float[Array, "K m"],
+    is_column: Bool[Array, " m"],
+    *,
+    tolerance: Float[ArrayLike, ""],
+    share: Float[ArrayLike, ""] = 0.0,
+    bound: Float[ArrayLike, ""] | None = None,
+    start: tuple[Float[ArrayLike, " K"], Float[ArrayLike, " m"]] | None = None,
 ) -> GameSolution:
-    """Solves one game; use `vmap` for many.
+    """Solves one game; works under `jit` and, for many games, `vmap`. No derivatives.
 
     Args:
       payoff: M [K, m].
@@ -166,17 +180,11 @@ def _step(payoff, is_row, is_column, point):
 
     mu = (w @ s + q @ d) / count
     dw, dq, ds, dd, _, _ = direction(0.0, 0.0)
-    length = _longest(((w, dw), (q, dq), (s, ds), (d, dd)))
+    length = longest_step((w, dw), (q, dq), (s, ds), (d, dd), most=_LONGEST)
     ahead = ((w + length * dw) @ (s + length * ds) + (q + length * dq) @ (d + length * dd)) / count
-    mu *= jnp.clip((ahead / mu) ** 3, _LEAST_CENTRING, 1.0)
+    mu = mehrotra_target(mu, ahead, _LEAST_CENTRING)
     dw, dq, ds, dd, dv, dt = direction(mu - dw * ds, mu - dq * dd)
-    length = jnp.minimum(1.0, _TO_BOUNDARY * _longest(((w, dw), (q, dq), (s, ds), (d, dd))))
+    length = longest_step((w, dw), (q, dq), (s, ds), (d, dd), to_boundary=_TO_BOUNDARY)
     moved = (w + length * dw, q + length * dq, v + length * dv, t + length * dt)
     is_finite = jnp.isfinite(length) & jnp.isfinite(moved[0].sum() + moved[1].sum() + moved[2] + moved[3])
     return jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), moved, point), is_finite
-
-
-def _longest(pairs) -> jax.Array:
-    """The longest step that keeps every value + step * change non-negative; at most 100."""
-    speed = jnp.stack([jnp.where(change < 0, -change / value, 0.0).max() for value, change in pairs])
-    return 1.0 / jnp.maximum(speed.max(), 0.01)

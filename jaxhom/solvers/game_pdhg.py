@@ -6,17 +6,23 @@ Any w gives the upper bound max_j (M^T w)_j, any q the lower bound min_i (M q)_i
 columns the policies met so far.
 """
 
-import chex
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 
 from jaxhom.solvers.projections import project_simplex
+from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Bool, Float
 
 _ABSENT = -1e30  # keeps the probability of a column that does not exist at zero
 
 
-@chex.dataclass(frozen=True)
-class MatrixGame:
+class MatrixGame(Record):
     """A batch of games.
 
     Attributes:
@@ -25,10 +31,10 @@ class MatrixGame:
       is_column: bool [m, lanes], which columns exist; at least one.
     """
 
-    payoff: jax.Array
-    is_column: jax.Array
+    payoff: Float[Array, "lanes K m"]
+    is_column: Bool[Array, "m lanes"]
 
-    def start(self) -> tuple[jax.Array, jax.Array]:
+    def start(self) -> tuple[Float[Array, "K lanes"], Float[Array, "m lanes"]]:
         """Uniform strategies."""
         lanes, rows, columns = self.payoff.shape
         w = jnp.full((rows, lanes), 1.0 / rows, self.payoff.dtype)

@@ -9,17 +9,24 @@ per state) are eliminated on the side where they cost less. *Before* the core if
 part is diagonal, and where each concerns few states the band stays narrow. *After* it otherwise, as a dense border.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 
 from jaxhom.solvers.block_tridiagonal import BlockCholesky, order_in_blocks
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 _REGULARISATION = 1e-14  # share of each diagonal entry of what is factorised
 _REFINEMENTS = 2  # per solve, at most: as d spreads, the factorisation alone loses digits
 _ACCURATE = 1e-8  # share of the right-hand side that may be missing
-_MIN_BLOCK = 32
-_DENSE = 0.2  # share of entries from which on dense products are faster
+_MIN_BLOCK = 32  # smaller ones are more calls, not less work
+_DENSE = 0.2  # share of entries from which on dense products are taken to be faster
 
 
 class Rows:
@@ -35,7 +42,7 @@ class Rows:
       work: multiplications of one factorisation, about.
     """
 
-    def __init__(self, matrix, free_columns: np.ndarray, num_core: int):
+    def __init__(self, matrix: scipy.sparse.sparray, free_columns: Float[np.ndarray, "n q"], num_core: int):
         matrix = scipy.sparse.csr_array(matrix)
         self.matrix, self.transpose, self.free_columns = _stored(matrix), _stored(matrix.T), free_columns
         core, others = matrix[:num_core], matrix[num_core:]
@@ -46,14 +53,16 @@ class Rows:
             self._normal = before if before.work <= self._normal.work else self._normal
         self.work = self._normal.work
 
-    def factor(self, d: np.ndarray) -> None:
+    def factor(self, d: Float[np.ndarray, " m"]) -> None:
         """Factorises the system for d [m] positive; `numpy.linalg.LinAlgError` where rounding makes it indefinite."""
         self._d = d
         self._normal.factor(d)
         self._behind_free = self._normal.solve(self.free_columns)
         self._free_block = self.free_columns.T @ self._behind_free
 
-    def solve(self, right: np.ndarray, free_right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def solve(
+        self, right: Float[np.ndarray, " n"], free_right: Float[np.ndarray, " q"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
         """(y, f), with iterative refinement."""
         y, f = self._solve_once(right, free_right)
         scale = np.abs(right).max(initial=np.abs(free_right).max(initial=0.0))

@@ -7,16 +7,25 @@ because a `reduce` whose kept axis is the last is not vectorised. And the steps 
 one, XLA fuses whatever produced the argument into every step and computes it again.
 """
 
+from __future__ import annotations
+
 import functools
 import operator
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 
-_MAX_TERMS = 32
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
+_MAX_TERMS = 32  # of a written-out sum: what it takes to compile grows with them
 
 
-def reduce_leading(array: jax.Array, axes: tuple[int, ...], operation=operator.add) -> jax.Array:
+def reduce_leading(
+    array: Float[Array, "..."], axes: tuple[int, ...], operation: Callable = operator.add
+) -> Float[Array, "..."]:
     """Reduces over `axes`, as written-out chains of at most 32 terms at a time; the last axis by a plain reduction."""
     for axis in sorted(axes, reverse=True):
         array = _reduce_axis(array, axis, operation)
@@ -40,7 +49,7 @@ def _reduce_axis(array: jax.Array, axis: int, operation) -> jax.Array:
     return operation(total, _reduce_axis(tail, axis, operation))
 
 
-def project_simplex(point: jax.Array, total: float = 1.0, *, axis: int = 0) -> jax.Array:
+def project_simplex(point: Float[Array, "..."], total: float = 1.0, *, axis: int = 0) -> Float[Array, "..."]:
     """argmin_x |x - point|^2 subject to x >= 0, sum(x, axis) = total."""
 
     def project(point):
@@ -50,7 +59,7 @@ def project_simplex(point: jax.Array, total: float = 1.0, *, axis: int = 0) -> j
     return _compute_once(project, point)
 
 
-def project_l1_ball(point: jax.Array, *, axes: tuple[int, ...]) -> jax.Array:
+def project_l1_ball(point: Float[Array, "..."], *, axes: tuple[int, ...]) -> Float[Array, "..."]:
     """argmin_y |y - point|^2 subject to sum(|y|, axes) <= 1."""
 
     def project(point):

@@ -9,24 +9,28 @@ that would otherwise end far apart: programs over occupancies stall without them
 Certificates are left to the caller, who knows how to make feasible points of z and of the multipliers.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
 
-import chex
+from typing import TYPE_CHECKING, NamedTuple
+
 import numpy as np
 
 from jaxhom.solvers.normal_equations import Rows
-from jaxhom.status import Status
+from jaxhom.solvers.predictor_corrector import longest_step, mehrotra_target, towards_centre
+from jaxhom.status import Record, Status
 
-_TO_BOUNDARY = 0.995
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_TO_BOUNDARY = 0.995  # of the way: points stay positive
 _PATIENCE = 30  # steps without a smaller error, after which rounding has won
 _CORRECTORS = 3  # after Mehrotra's, at most
 _LONGER = 0.3  # what a corrector aims to add to the step
 _SOME = 0.03  # what it has to add to be kept
-_EVEN = 0.1  # products between this share of the target and its inverse are let be
+_SPREAD = 10.0  # products within this factor of the target stay as they are
 
 
-@chex.dataclass(frozen=True)
-class InteriorPoint:
+class InteriorPoint(Record):
     """An iterate.
 
     Attributes:
@@ -36,17 +40,25 @@ class InteriorPoint:
       steps: steps taken in all. status: SOLVED, or why the steps ended.
     """
 
-    z: np.ndarray
-    f: np.ndarray
-    y: np.ndarray
-    s: np.ndarray
+    z: Float[np.ndarray, " m"]
+    f: Float[np.ndarray, " q"]
+    y: Float[np.ndarray, " n"]
+    s: Float[np.ndarray, " m"]
     error: float = np.inf
     iterations: int = 0
     steps: int = 0
     status: Status = Status.STALLED
 
 
-def solve(rows: Rows, cost, free_cost, right, *, tolerance: float = 1e-9, max_iterations: int = 100) -> InteriorPoint:
+def solve(
+    rows: Rows,
+    cost: Float[np.ndarray, " m"],
+    free_cost: Float[np.ndarray, " q"],
+    right: Float[np.ndarray, " n"],
+    *,
+    tolerance: float = 1e-9,
+    max_iterations: int = 100,
+) -> InteriorPoint:
     """Solves one program, or comes as near as rounding allows.
 
     Args:
@@ -140,15 +152,14 @@ def _step(rows: Rows, residuals, point: InteriorPoint) -> InteriorPoint:
 
     change = direction(-z * s, residuals)
     along, across = change.lengths(point)
-    mean = (z @ s) / len(z)
-    target = mean * ((z + along * change.z) @ (s + across * change.s) / (z @ s)) ** 3
+    ahead = (z + along * change.z) @ (s + across * change.s)
+    target = mehrotra_target((z @ s) / len(z), ahead / len(z), most=np.inf)
     change = direction(target - z * s - change.z * change.s, residuals)
     along, across = change.lengths(point)
     for _ in range(_CORRECTORS):
         further_along, further_across = min(1.0, along + _LONGER), min(1.0, across + _LONGER)
         products = (z + further_along * change.z) * (s + further_across * change.s)
-        wanted = np.clip(products, _EVEN * target, target / _EVEN) - products
-        corrected = change.corrected(direction(np.maximum(wanted, -target / _EVEN), nothing))
+        corrected = change.corrected(direction(towards_centre(products, target, _SPREAD), nothing))
         longer_along, longer_across = corrected.lengths(point)
         if longer_along + longer_across < along + across + _SOME:
             break
@@ -172,9 +183,5 @@ class _Change(NamedTuple):
 
     def lengths(self, point: InteriorPoint, share: float = 1.0) -> tuple[float, float]:
         """The longest steps up to 1 that leave z, and s, positive; times `share` where the boundary is in the way."""
-        return _length(point.z, self.z, share), _length(point.s, self.s, share)
-
-
-def _length(value: np.ndarray, change: np.ndarray, share: float) -> float:
-    falling = change < 0
-    return min(1.0, share * float(np.min(-value[falling] / change[falling], initial=np.inf)))
+        sides = (point.z, self.z), (point.s, self.s)
+        return tuple(float(longest_step(side, to_boundary=share)) for side in sides)

@@ -11,8 +11,8 @@ import oracles
 import pytest
 import small_models
 
-from jaxhom import MDP, Status, gridworld, lpal
-from jaxhom.apprenticeship import interior_point, quickest
+from jaxhom import LPAL, MDP, Status, gridworld, lpal
+from jaxhom.apprenticeship import certificate, column_rounds, flow, interior_point, presolve, quickest
 
 METHODS = ["columns", "flow", "interior_point", "auto"]
 
@@ -406,3 +406,65 @@ def test_traced_input_is_refused():
     ):
         with pytest.raises(ValueError, match="call it outside jit and vmap"):
             jax.jit(function)(argument)
+
+
+# ------------------------------------------------------------------------------------- prepared models
+
+
+def count_calls(monkeypatch, owner, name, counts):
+    made = getattr(owner, name)
+
+    def counted(*args, **keywords):
+        counts[name] = counts.get(name, 0) + 1
+        return made(*args, **keywords)
+
+    monkeypatch.setattr(owner, name, counted)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["grid", "dense"])
+def test_a_prepared_model_gives_the_same_and_prepares_nothing_twice(name, method, monkeypatch):
+    """Two solves through one handle are two calls of `lpal`, to the bit; the second makes no matrix and no factor."""
+    here = grid(8) if name == "grid" else dense(6)
+    mdp = here.mdp.replace(features=3.0 * here.mdp.features)  # in another unit than that of the methods
+    first = here.expectations["Monte Carlo"] if name == "grid" else here.expectations
+    options = {"method": method, "tolerance": 1e-2}
+    plain = [lpal(mdp, factor * first, **options) for factor in (3.0, 2.0)]
+    counts = {}
+    for owner, what in (
+        (certificate, "Exact"),
+        (presolve.Reach, "of"),
+        (interior_point, "Program"),
+        (flow, "FlowProgram"),
+        (column_rounds, "with_compact_features"),
+    ):
+        count_calls(monkeypatch, owner, what, counts)
+    prepared = LPAL(mdp)
+    solutions = [prepared.solve(3.0 * first, **options)]
+    made = dict(counts)
+    assert made["Exact"] == made["of"] == 1
+    solutions.append(prepared.solve(2.0 * first, **options))
+    assert counts == made
+    jax.tree.map(np.testing.assert_array_equal, solutions, plain)
+
+
+def test_a_prepared_model_has_derivatives():
+    here = dense(6)
+    given = jnp.asarray(here.expectations)
+    expected = jax.grad(lambda e: lpal(here.mdp, e).margin.sum())(given)
+    prepared = LPAL(here.mdp)
+    np.testing.assert_array_equal(jax.grad(lambda e: prepared.solve(e).margin.sum())(given), expected)
+    by_discount = [
+        jax.grad(lambda discount, solve=solve: solve(here.mdp.replace(discount=discount)))(here.mdp.discount)
+        for solve in (lambda mdp: lpal(mdp, given[0]).margin, lambda mdp: LPAL(mdp).solve(given[0]).margin)
+    ]
+    assert by_discount[0] == by_discount[1] != 0.0
+
+
+def test_prepared_models_and_solutions_are_short_when_printed():
+    here = dense(6)
+    prepared = LPAL(here.mdp)
+    solution = prepared.solve(here.expectations)
+    assert repr(prepared).startswith("LPAL(MDP(") and len(repr(prepared)) < 500
+    assert "status=[8 SOLVED]" in repr(solution) and len(repr(solution)) < 300
+    assert "margin=-" in repr(prepared.solve(here.expectations[0] + 100.0))

@@ -17,7 +17,7 @@ from jaxhom import MDP, Status, lpal
 from jaxhom.apprenticeship import exact as exact_module
 from jaxhom.apprenticeship.exact import Exact, exact_rows, rounded_down
 from jaxhom.apprenticeship.flow_lp import project_weighted_simplex
-from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectations
+from jaxhom.apprenticeship.presolve import Reach, default_tolerance, reduce_expectations
 from jaxhom.solvers.normal_equations import Rows
 
 METHODS = ["auto", "columns", "interior_point", "flow"]
@@ -185,14 +185,16 @@ def test_one_feature_of_awkward_size():
 def test_the_default_tolerance_is_small_against_what_features_can_do(features, scale):
     mdp = one_state(features)
     expectations = 20.0 * np.asarray(features)[1:2]  # those of the second action
-    reduction = reduce_expectations(mdp, expectations)
-    np.testing.assert_allclose(default_tolerance(mdp, reduction), 1e-5 / 0.05 * scale, rtol=1e-12)
+    reach = Reach.of(mdp)
+    reduction = reduce_expectations(reach, expectations)
+    np.testing.assert_allclose(default_tolerance(reach, reduction), 1e-5 / 0.05 * scale, rtol=1e-12)
 
 
 def test_features_that_are_never_the_smallest_have_no_say_in_the_tolerance():
     mdp = one_state([[0.0, 0.0], [1e-8, 1.0]])
-    reduction = reduce_expectations(mdp, np.array([[-100.0, 0.0], [0.0, 0.0]]))
-    np.testing.assert_allclose(default_tolerance(mdp, reduction), [1e-5 / 0.05, 1e-13 / 0.05], rtol=1e-12)
+    reach = Reach.of(mdp)
+    reduction = reduce_expectations(reach, np.array([[-100.0, 0.0], [0.0, 0.0]]))
+    np.testing.assert_allclose(default_tolerance(reach, reduction), [1e-5 / 0.05, 1e-13 / 0.05], rtol=1e-12)
 
 
 @pytest.mark.parametrize("method", METHODS)

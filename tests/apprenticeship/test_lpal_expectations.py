@@ -11,7 +11,7 @@ import pytest
 import small_models
 
 from jaxhom import MDP, Status, lpal
-from jaxhom.apprenticeship.presolve import reduce_expectations
+from jaxhom.apprenticeship.presolve import Reach, reduce_expectations
 
 METHODS = ["columns", "interior_point"]
 S, A, K = 6, 2, 6
@@ -155,7 +155,7 @@ def test_reduction_changes_no_margin(name, rng):
     features = FEATURES[name]
     mdp = MDP.from_dense(TRANSITION, discount=DISCOUNT, initial=INITIAL, features=features)
     expectations = random_expectations(rng)
-    reduction = reduce_expectations(mdp, expectations)
+    reduction = reduce_expectations(Reach.of(mdp), expectations)
     for policy in small_models.random_policy(rng, 20, S, A):
         reached = oracles.feature_expectations(TRANSITION, DISCOUNT, INITIAL, features, policy)
         given = (reached - expectations).min(axis=1)
@@ -170,7 +170,7 @@ def test_expectations_within_reach_stay_as_they_are(rng):
     mdp = MDP.from_dense(TRANSITION, discount=DISCOUNT, initial=INITIAL, features=RANDOM)
     policies = small_models.random_policy(rng, 20, S, A)
     reached = [oracles.feature_expectations(TRANSITION, DISCOUNT, INITIAL, RANDOM, policy) for policy in policies]
-    reduction = reduce_expectations(mdp, np.stack(reached))
+    reduction = reduce_expectations(Reach.of(mdp), np.stack(reached))
     np.testing.assert_array_equal(reduction.expectations, reached)
     assert not reduction.shift.any() and not reduction.is_idle.any()
 
@@ -184,7 +184,7 @@ def test_reduction_knows_that_rounded_rows_do_not_sum_to_one(rng):
     policy = small_models.random_policy(rng, S, A)
     reached = oracles.feature_expectations(transition.astype(float), 0.999, INITIAL, features, policy)
     expectations = 950.0 * (np.arange(K) > 0)  # out of reach, but not of 1 / (1 - discount)
-    reduction = reduce_expectations(mdp, expectations[None])
+    reduction = reduce_expectations(Reach.of(mdp), expectations[None])
     margin = (reached - expectations).min()
     assert margin < -10
     np.testing.assert_allclose((reached - reduction.expectations).min() + reduction.shift, margin, rtol=1e-4)

@@ -47,7 +47,7 @@ def project(problem, point):
 def test_projection_on_the_flow(name, lanes, rng):
     """The nearest point of the affine set, by least squares on the dense rows."""
     mdp, arrays = model(name)
-    problem = flow._make_problem(mdp, jnp.zeros((lanes, mdp.num_features)))
+    problem = flow.FlowProgram(mdp).problem(jnp.zeros((lanes, mdp.num_features)))
     assert (len(problem.projection.diagonal) > 1) == (name in ("absorbing", "grid"))
     assert problem.features.shape[1] == (1 if name == "grid" else mdp.num_actions)
     rows, right = affine_rows(arrays)
@@ -78,7 +78,7 @@ def test_the_iteration_converges_to_the_program():
     mdp, arrays = model("dense")
     expectations = np.random.default_rng(11).uniform(0.3, 0.7, size=(1, 2)) / (1 - arrays[1])
     _, x, weights = oracles.lpal(*arrays, expectations[0])
-    problem = flow._make_problem(mdp, jnp.asarray(expectations))
+    problem = flow.FlowProgram(mdp).problem(jnp.asarray(expectations))
     state = flow._start(problem, jnp.full((1, *x.shape), 1.0 / x.shape[1]))
     for _ in range(8):
         state = flow._advance(problem, state)
@@ -94,7 +94,7 @@ def test_proximal_steps(rng):
 
     mdp, arrays = model("dense")
     expectations = rng.uniform(size=(3, 2))
-    problem = flow._make_problem(mdp, jnp.asarray(expectations))
+    problem = flow.FlowProgram(mdp).problem(jnp.asarray(expectations))
     pairs, step = mdp.num_states * mdp.num_actions, np.array([0.1, 1.0, 10.0])
     point = rng.normal(size=(pairs + 2, 3))
     result = np.asarray(problem.project_primal(point, step))

@@ -13,6 +13,7 @@ import pytest
 from cli_cases import ACTIONS, LAKE, STATES, TRAJECTORIES, VISITED, Files, lake_transition, values
 
 import jaxhom
+from jaxhom.apprenticeship import lpal
 from jaxhom.cli import learn, methods, results, sources
 from jaxhom.cli.options import environment_options
 from jaxhom.cli.parser import main
@@ -63,8 +64,11 @@ def test_every_method_writes_its_policy(files, capsys, options):
 
 
 REACHED = {
-    "--distance 2 --printed": ("class_similarity", {"distance": 2, "anchored": False}),
-    "--threshold 0.2 --tolerance 0.1": ("class_similarity", {"threshold": 0.2, "tolerance": 0.1, "anchored": True}),
+    "--distance 2 --printed": ("soft_local_homomorphism", {"distance": 2, "anchored": False, "mutual": False}),
+    "--threshold 0.2 --tolerance 0.1": (
+        "soft_local_homomorphism",
+        {"threshold": 0.2, "tolerance": 0.1, "anchored": True, "mutual": False},
+    ),
     "--method soft-homomorphism": ("soft_homomorphism", {"anchored": True}),
     "--method soft-homomorphism --printed --tolerance 0.2 --max-iterations 64": (
         "soft_homomorphism",
@@ -84,7 +88,8 @@ def test_options_reach_their_method(files, monkeypatch, options):
 
     monkeypatch.setattr(methods, name, record)
     assert main(["learn", *files.options(), *options.split()]) == 130
-    given.pop("progress", None)
+    for name in ("progress", "states", "table"):
+        given.pop(name, None)
     assert given == expected
 
 
@@ -148,6 +153,10 @@ def test_the_solver_and_its_tolerance_reach_lpal(files, monkeypatch, options, so
     arguments = [*files.options(), "--method", "monte-carlo", "--features", "states", "--lpal-tolerance", "0.1"]
     assert main(["learn", *arguments, *options.split()]) == 130
     assert (given["method"], given["tolerance"], given["initial_policy"]) == (solver, 0.1, None)
+
+
+def test_every_solver_of_lpal_can_be_chosen():
+    assert set(learn._LPAL_METHODS) == set(lpal._METHODS)
 
 
 def test_values_against_the_optimum(files, capsys):

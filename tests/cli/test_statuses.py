@@ -39,10 +39,8 @@ def test_remarks_are_about_what_did_not_end_as_asked(answers, lines):
 def unfinished(problem, demonstrations, *_, **__):
     """A generalization with pairs that stayed undecided."""
     general = uniform_elsewhere(problem.mdp, demonstrations)
-    known = {name: getattr(general, name) for name in ("policy", "visited", "radius", "support", "explain")}
-    undecided = np.zeros(problem.mdp.num_states, int)
-    undecided[1] = 3
-    return types.SimpleNamespace(**known, undecided=undecided, status=np.array(LIMIT)), {}
+    undecided = 3 * (np.arange(problem.mdp.num_states) == 1)
+    return general.replace(undecided=undecided, status=np.array(LIMIT)), {}
 
 
 @pytest.fixture

@@ -70,7 +70,8 @@ def made_up(domain, radius, support):
     """A generalization with given radii, all of whose policies take action 1, except uniform ones."""
     num_states, num_actions = domain.mdp.num_states, domain.mdp.num_actions
     policy = np.where((radius < 0)[:, None], 1 / num_actions, np.eye(num_actions)[np.ones(num_states, int)])
-    return Generalization(policy=policy, visited=radius == 0, radius=radius, support=support)
+    known = {"undecided": np.zeros_like(radius), "status": np.array(0)}
+    return Generalization(policy=policy, visited=radius == 0, radius=radius, support=support, **known)
 
 
 # ------------------------------------------------------------------------------------ generalizations

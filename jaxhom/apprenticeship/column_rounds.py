@@ -1,0 +1,197 @@
+"""One round of LPAL on columns for some lanes: best responses to their queries, then the games over their columns.
+
+The work of a half round is cut into programs of a fixed width, which run beside each other on the cores. Nothing that a
+program reads depends on another of the same half, so the answer does not depend on which is first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom.apprenticeship.column_games import capacities, play
+from jaxhom.apprenticeship.column_lane import SLACK, Lane
+from jaxhom.apprenticeship.exact import NEAR_ONE, Exact
+from jaxhom.apprenticeship.interior_point import Point
+from jaxhom.apprenticeship.policy_pool import PolicyPool
+from jaxhom.apprenticeship.request import Request
+from jaxhom.apprenticeship.responses import evaluate, evaluate_on_host, respond, respond_on_host, with_compact_features
+from jaxhom.apprenticeship.solution import Found
+from jaxhom.models.mdp import MDP, uniform_policy
+from jaxhom.planning.occupancy import policy_from_occupancy
+from jaxhom.solvers.game_interior_point import GameSolution
+from jaxhom.status import Status
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_PULLS = (0.3, 0.7)  # shares of the best bound's weights in a query; the second where a core would be idle
+_FEW_FEATURES, _FEW_PULLS = 8, (0.0, 0.5)  # up to here the weights do not jump
+_LOOSE_GAME = 0.5  # share of the open gap that the game may leave
+_LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to the bound: more digits prove nothing more
+_NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact, and many rare states add up
+_FROM_POOL = 8  # policies of other lanes that join a game at a time
+_WORTHWHILE = 0.1  # share of the open gap by which they have to be better
+
+
+class Rounds:
+    """What the lanes of a request share.
+
+    Args:
+      request: the lanes.
+      limit: columns of a lane.
+      width: lanes of one program.
+      workers: programs at a time, run by `run`: a `map` over threads.
+    """
+
+    def __init__(self, request: Request, limit: int, width: int, workers: int, run: Callable):
+        mdp, self._request, self._limit = request.model.mdp, request, limit
+        self._width, self._workers, self._run = width, workers, run
+        self._mdp, self._pool = request.model.once(with_compact_features), PolicyPool(mdp)
+        self._room = capacities(mdp.num_features)[-1]
+        self._pulls = _FEW_PULLS if mdp.num_features <= _FEW_FEATURES else _PULLS
+        self._error = 0.25 * SLACK * float(request.tolerance.min())
+        self._exact = request.model.once(_exact_where_rough)
+
+    def lane(self, number: int) -> Lane:
+        """The lane of one problem; with a first column if there is a policy to begin with."""
+        asked = self._request
+        expectations, spent = asked.expectations[number], 0 if asked.spent is None else int(asked.spent[number])
+        uniform = np.full(len(expectations), 1.0 / len(expectations))
+        weights = uniform if asked.weights is None else asked.weights[number]
+        value = np.zeros(self._mdp.num_states)
+        lane = Lane(expectations, float(asked.tolerance[number]), value, weights, made=spent)
+        if asked.policy is not None:
+            self._add_policy(lane, asked.policy[number])
+        return lane
+
+    def resume(self, lane: Lane, point: Point) -> None:
+        """Takes in what another method has found: its policy as a column, its weights as the next query."""
+        best = uniform_policy(self._mdp) if lane.actions is None else self._pool.one_hot(lane.actions)
+        self._add_policy(lane, policy_from_occupancy(self._mdp, point.x, np.asarray(best)))
+        lane.guess, lane.value, lane.made = point.weights, point.value, lane.made + point.steps
+
+    def _add_policy(self, lane: Lane, policy: Float[np.ndarray, "S A"]) -> None:
+        """A column of a policy that may be stochastic."""
+        if self._exact is None:
+            evaluated = evaluate(self._mdp, policy)
+        else:
+            evaluated = evaluate_on_host(self._exact, policy, self._error)
+        mu, expected = map(np.asarray, evaluated)
+        if np.isfinite(expected).all():
+            lane.add([self._pool.add(mu, np.asarray(policy), expected)], self._room)
+
+    # ---------------------------------------------------------------------------------------------- best responses
+
+    def respond_to(self, lanes: list[Lane]) -> None:
+        """Best responses of every lane to its query: columns, and upper bounds. Cores left over ask once more."""
+        per_lane = max(1, min(len(self._pulls), self._workers // len(lanes)))
+        is_first = lanes[0].row_probabilities is None
+        pulls = self._pulls[: 1 if is_first else per_lane]
+        asked = [
+            (lane, pull)
+            for number, pull in enumerate(pulls)
+            for lane in lanes
+            if number == 0 or (lane.guess is None and lane.made + number < self._limit)
+        ]
+        for lane in lanes:
+            lane.idle += 1
+        for chunk, answers in self._in_chunks(self._respond, asked):
+            for k, (lane, _) in enumerate(chunk):
+                self._take(lane, {name: array[k] for name, array in answers.items()})
+
+    def _respond(self, asked: list[tuple[Lane, float]]) -> dict[str, np.ndarray]:
+        goals = [lane.tolerance for lane, _ in asked]
+        open_ = [lane.gap if np.isfinite(lane.gap) else 0.0 for lane, _ in asked]
+        accuracy = np.maximum(goals, _LOOSE_PLANNING * np.array(open_))
+        if self._exact is not None:
+            parts = [
+                respond_on_host(self._exact, lane.expectations, lane.query(pull), lane.value, goal, self._error)
+                for (lane, pull), goal in zip(asked, accuracy, strict=True)
+            ]
+            return jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+        # Lanes that do not exist repeat the first; asked for nothing, they stop at once.
+        padded = asked + [asked[0]] * (self._width - len(asked))
+        accuracy = np.append(accuracy, np.full(len(padded) - len(asked), np.inf))
+        given = ([lane.expectations for lane, _ in padded], [lane.query(pull) for lane, pull in padded])
+        arrays = (*given, [lane.value for lane, _ in padded], accuracy)
+        arrays = (np.asarray(array, self._mdp.dtype) for array in arrays)
+        return jax.tree.map(np.asarray, respond(self._mdp, *arrays, self._error))
+
+    def _take(self, lane: Lane, answer: dict[str, np.ndarray]) -> None:
+        lane.made, lane.guess = lane.made + 1, None
+        if np.isfinite(answer["expected"]).all():
+            lane.add([self._pool.add(answer["occupancy"], answer["actions"], answer["expected"])], self._room)
+        if np.isfinite(answer["value"]).all():
+            lane.value = answer["value"]
+        lane.take_bound(answer)
+
+    # ------------------------------------------------------------------------------------------------------- games
+
+    def play_games(self, lanes: list[Lane]) -> None:
+        """The game over every lane's columns: a lower bound, its mixture, and weights for the next query.
+
+        Policies that other lanes have met join where they are better than what the game has; then it is played again.
+        """
+        self._play([lane for lane in lanes if lane.columns.size])
+        self._play([lane for lane in lanes if self._join_from_pool(lane)])
+        for lane in lanes:
+            lane.gaps.append(lane.gap)
+
+    def _join_from_pool(self, lane: Lane) -> bool:
+        """Adds the policies that are worth most at the query; False if none is worth much more than the lane's own."""
+        if not lane.columns.size:
+            return False
+        worth = (self._pool.expected - lane.expectations) @ lane.query(self._pulls[0])
+        limit = worth[lane.columns].max() + _WORTHWHILE * max(lane.gap, 0.0)
+        best = np.argsort(worth)[-_FROM_POOL:]
+        best = best[worth[best] > limit]
+        lane.add(best, self._room)
+        return best.size > 0
+
+    def _play(self, lanes: list[Lane]) -> None:
+        for chunk, games in self._in_chunks(self._solve_games, lanes):
+            for k, lane in enumerate(chunk):
+                lane.take_game(games.w[k], games.q[k], games.lower[k])
+
+    def _solve_games(self, lanes: list[Lane]) -> GameSolution:
+        payoffs = [(self._pool.expected[lane.columns] - lane.expectations).T for lane in lanes]
+        former = [
+            (0.0 if lane.row_probabilities is None else lane.row_probabilities, lane.probabilities) for lane in lanes
+        ]
+        bounds = [lane.bound for lane in lanes]
+        goals = [0.25 * lane.tolerance for lane in lanes]
+        return play(payoffs, former, bounds, goals, _LOOSE_GAME, self._width)
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def _in_chunks(self, work: Callable, items: list) -> zip:
+        """(items, what `work` makes of them), so many items at a time as a program is wide."""
+        chunks = [items[first : first + self._width] for first in range(0, len(items), self._width)]
+        return zip(chunks, self._run(work, chunks), strict=True)
+
+    def found(self, lanes: list[Lane]) -> Found:
+        """What all lanes end with. A lane whose programs all failed has nothing: its policy is anybody's guess."""
+        shape = self._mdp.num_states, self._mdp.num_actions
+        x = [np.zeros(shape) if lane.mixture is None else self._pool.mixture(*lane.mixture) for lane in lanes]
+        nothing = np.full(shape[0], np.nan)
+        counts = np.array([lane.made for lane in lanes])
+        return Found(
+            x=np.stack(x),
+            weights=np.stack([lane.weights for lane in lanes]),
+            value=np.stack([nothing if lane.best_value is None else lane.best_value for lane in lanes]),
+            iterations=counts,
+            stopped=np.where(counts >= self._limit, Status.ITERATION_LIMIT, Status.STALLED),
+            negligible=_NO_OCCUPANCY,
+        )
+
+
+def _exact_where_rough(mdp: MDP) -> Exact | None:
+    """The model on the host, where its type or iterations have no digits left near this discount."""
+    is_rough = mdp.dtype != jnp.float64 or float(mdp.discount) > NEAR_ONE
+    exact = Exact(mdp) if is_rough else None
+    return exact if exact and exact.is_direct else None

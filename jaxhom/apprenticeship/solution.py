@@ -1,0 +1,83 @@
+"""What a method of LPAL answers, `Found`, and what the caller gets, `LPALSolution`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxhom.planning.occupancy import NO_OCCUPANCY
+from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float, Int
+
+
+class LPALSolution(Record):
+    """A policy with its margin and a bound on the best margin; a batch adds a leading axis [B] to every field.
+
+    The bounds hold whatever the status is. A pytree: `jax.tree.map(lambda leaf: leaf[2], solution)` is its third lane.
+
+    Attributes:
+      policy: [S, A], rows sum to 1.
+      occupancy: [S, A], of that policy; sums to 1 / (1 - discount).
+      margin: scalar, min_i V_i(policy) - expectations_i, the true margin of the returned policy, rounded down.
+      margin_bound: scalar, no policy's margin is larger; rounded up.
+      weights: [K], the reward weights that prove `margin_bound`: non-negative, sum 1.
+      iterations: int32 scalar: columns, interior-point steps or PDHG iterations.
+      status: int32 scalar, a `jaxhom.Status`.
+    """
+
+    policy: Float[Array, "*B S A"]
+    occupancy: Float[Array, "*B S A"]
+    margin: Float[Array, "*B"]
+    margin_bound: Float[Array, "*B"]
+    weights: Float[Array, "*B K"]
+    iterations: Int[Array, "*B"]
+    status: Int[Array, "*B"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Found:
+    """What a method proposes for its lanes, in NumPy; nothing of it certified.
+
+    Attributes:
+      x: [B, S, A], an occupancy up to scale and rounding, whose policy (eq. 5) is meant.
+      weights: [B, K], about in the simplex.
+      iterations: int [B]. stopped: [B], the status of a lane whose gap turns out to be open.
+      value: [B, S], guesses of the optimal values for the weights, in the method's units; or None.
+      negligible: share of all discounted time below which x is taken for nothing; of each lane [B], or of all.
+    """
+
+    x: Float[np.ndarray, "B S A"]
+    weights: Float[np.ndarray, "B K"]
+    iterations: Int[np.ndarray, " B"]
+    stopped: Int[np.ndarray, " B"]
+    value: Float[np.ndarray, "B S"] | None = None
+    negligible: Float[np.ndarray, " B"] | float = NO_OCCUPANCY
+
+    def lane(self, number: int) -> Found:
+        """One lane, without its axis."""
+        return Found(**{name: None if leaf is None else leaf[number] for name, leaf in self._by_lane().items()})
+
+    def with_lanes(self, numbers: Int[np.ndarray, " C"], other: Found) -> Found:
+        """What was found, with the given lanes as in `other`."""
+
+        def exchanged(mine, others):
+            if mine is None or others is None:
+                return None
+            mine = np.array(mine)
+            mine[numbers] = others
+            return mine
+
+        pairs = zip(self._by_lane().items(), other._by_lane().values(), strict=True)
+        return Found(**{name: exchanged(mine, others) for (name, mine), others in pairs})
+
+    def is_as(self, other: Found) -> bool:
+        """Whether two lanes say the same."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return all(one is two or (one is not None and np.array_equal(one, two, equal_nan=True)) for one, two in pairs)
+
+    def _by_lane(self) -> dict[str, Any]:
+        return vars(self) | {"negligible": np.broadcast_to(self.negligible, np.shape(self.iterations))}

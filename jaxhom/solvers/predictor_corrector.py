@@ -1,0 +1,68 @@
+"""The rules that primal-dual interior-point methods share: how long a step, how central a target, what to correct.
+
+Such a method keeps pairs of positive vectors, here value and slack, and steers their products towards one small number:
+Mehrotra (1992) first aims at 0 (the predictor), reads off how far that gets, and aims again at a target that is the
+smaller the further it got, with the products of the first changes taken into account (the corrector). Gondzio (1996)
+adds correctors that pull together the products that would end far apart.
+
+What a step solves differs from method to method and stays with it. Arrays of NumPy and of JAX both work: on the host
+the products are few and a call into JAX would take longer than all of them, inside a program NumPy cannot be. The
+methods for single problems use this (`game_interior_point`, `sparse_interior_point`); the one of the similarity has its
+lanes last and its steps in a loop that is compiled once, and has these rules per lane.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
+
+def longest_step(
+    *pairs: tuple[Float[Array, " n"], Float[Array, " n"]], most: float = 1.0, to_boundary: float = 1.0
+) -> Float[Array, ""]:
+    """The longest step that keeps every value + step * change non-negative, `to_boundary` of the way; at most `most`.
+
+    Args:
+      pairs: (value, change), values positive.
+      most: where nothing is in the way.
+      to_boundary: share of the way to the first boundary, below 1 for points that are to stay positive.
+    """
+    numpy = _module_of(pairs[0][0])
+    # Of values that all grow the speed is 0; `most` is then no boundary, and is kept.
+    speeds = [numpy.where(change < 0, -change / value, 0.0).max(initial=0.0) for value, change in pairs]
+    fastest = numpy.stack(speeds).max() if len(speeds) > 1 else speeds[0]
+    return 1.0 / numpy.maximum(fastest / to_boundary, 1.0 / most)
+
+
+def mehrotra_target(
+    mean: Float[Array, ""], ahead: Float[Array, ""], least: float = 0.0, most: float = 1.0
+) -> Float[Array, ""]:
+    """What products should become: their mean times (ahead / mean)^3, `ahead` being what the predictor leaves of it.
+
+    Args:
+      mean, ahead: of the products, now and after the predictor.
+      least: smallest factor; without one, products that nearly vanish leave the next step no room.
+      most: largest factor. Above 1 only where points are not feasible yet, and products may have to grow first.
+    """
+    numpy = _module_of(mean)
+    return mean * numpy.clip((ahead / mean) ** 3, least, most)
+
+
+def towards_centre(products: Float[Array, " n"], target: Float[Array, ""], spread: float) -> Float[Array, " n"]:
+    """What products lack to be within a factor `spread` of the target.
+
+    Large ones are corrected by no more than the largest product that is wanted: more would undo the step.
+    """
+    numpy = _module_of(products)
+    low, high = target / spread, target * spread
+    return numpy.maximum(numpy.clip(products, low, high) - products, -high)
+
+
+def _module_of(array) -> ModuleType:
+    return np if isinstance(array, np.ndarray | np.generic | float) else jnp

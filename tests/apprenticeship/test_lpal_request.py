@@ -1,0 +1,82 @@
+"""What methods are asked and answer: requests and answers in part and put together, lanes certified once."""
+
+import jax
+import numpy as np
+import oracles
+import pytest
+import small_models
+
+from jaxhom import Status
+from jaxhom.apprenticeship import lpal as lpal_module
+from jaxhom.apprenticeship.certificate import Certifier
+from jaxhom.apprenticeship.prepared import PreparedModel
+from jaxhom.apprenticeship.solution import Found
+
+
+def request_for(case, count=3):
+    expectations = np.random.default_rng(0).uniform(-3, 3, size=(count, case.features.shape[2]))
+    return lpal_module._presolved(PreparedModel(case.mdp), expectations, 1e-3), expectations
+
+
+def found_for(case, count=3, seed=0, **fields):
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(size=(count, *case.shape))
+    weights = rng.dirichlet(np.ones(case.features.shape[2]), size=count)
+    counts, stopped = np.arange(count), np.full(count, Status.STALLED)
+    return Found(x=x, weights=weights, iterations=counts, stopped=stopped, **fields)
+
+
+def test_a_part_of_a_request_has_its_lanes_numbers():
+    request, expectations = request_for(small_models.case("dense"), 5)
+    policies = np.random.default_rng(1).uniform(size=(2, 6, 2))
+    part = request.part(np.array([4, 1]), policy=policies, limit=7)
+    np.testing.assert_array_equal(part.lanes, [4, 1])
+    np.testing.assert_array_equal(part.expectations, expectations[[4, 1]])
+    np.testing.assert_array_equal(part.part(np.array([1])).lanes, [1])
+    np.testing.assert_array_equal(part.part(np.array([1])).policy, policies[1:])
+    assert (part.limit, part.weights, request.limit, len(request.lanes)) == (7, None, None, 5)
+
+
+@pytest.mark.parametrize("value", [None, np.ones((3, 6))])
+def test_lanes_of_an_answer_are_exchanged(value):
+    """What only one of two answers has is had by neither; shares of time stay each lane's own."""
+    case = small_models.case("dense")
+    mine, other = found_for(case, value=value), found_for(case, 2, seed=1, value=np.zeros((2, 6)), negligible=1e-14)
+    both = mine.with_lanes(np.array([2, 0]), other)
+    for one, expected in zip((2, 0, 1), (other.lane(0), other.lane(1), mine.lane(1)), strict=True):
+        np.testing.assert_array_equal(both.lane(one).x, expected.x)
+        np.testing.assert_array_equal(both.lane(one).weights, expected.weights)
+        assert both.lane(one).negligible == expected.negligible
+        assert (value is None) == (both.lane(one).value is None)
+    assert mine.iterations.tolist() == [0, 1, 2] and both.iterations.tolist() == [1, 1, 0]
+
+
+def test_a_lane_is_certified_once_as_long_as_nothing_new_is_found(monkeypatch):
+    case = small_models.case("dense")
+    request, expectations = request_for(case)
+    certify, seen = Certifier._certify, []
+    monkeypatch.setattr(
+        Certifier, "_certify", lambda self, lane, found: seen.append(lane) or certify(self, lane, found)
+    )
+    found = found_for(case, value=np.full((3, 6), np.nan))
+    first = request.certified(found)
+    assert seen == [0, 1, 2]
+    jax.tree.map(np.testing.assert_array_equal, first, request.certified(found.with_lanes(np.zeros(0, int), found)))
+    assert seen == [0, 1, 2]
+    again = request.part(np.array([1])).certified(found_for(case, 1, seed=2))
+    assert seen == [0, 1, 2, 1]
+    for solution, lane in ((first, 2), (again, 0)):
+        asked = expectations[2 if lane else 1]
+        true = oracles.margin(*case.arrays, asked, np.asarray(solution.policy[lane]))
+        np.testing.assert_allclose(solution.margin[lane], true, rtol=0, atol=1e-9)
+
+
+def test_what_is_prepared_is_made_once_in_units_of_about_one():
+    case = small_models.case("dense")
+    model = PreparedModel(case.mdp.replace(features=48.0 * case.mdp.features / np.abs(case.features).max()))
+    made = []
+    assert model.once(lambda mdp: made.append(mdp) or "made") == "made"
+    assert model.unit == 32.0 and np.abs(made[0].features).max() == 1.5
+    for _ in range(2):
+        model.once(made.append)
+    assert len(made) == 2 and made[1] is model.mdp

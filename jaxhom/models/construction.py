@@ -16,6 +16,7 @@ from jaxhom.models.successor_lists import SuccessorLists
 
 if TYPE_CHECKING:
     import jax
+    from jax.typing import DTypeLike
     from jaxtyping import ArrayLike, Bool, Float, Int
 
     from jaxhom.models.dynamics import Dynamics
@@ -73,7 +74,9 @@ def lists_of_successors(
     return next_state, probability, allowed
 
 
-def make_dynamics(next_state: Int[np.ndarray, "S A N"], probability: Float[np.ndarray, "S A N"], dtype) -> Dynamics:
+def make_dynamics(
+    next_state: Int[np.ndarray, "S A N"], probability: Float[np.ndarray, "S A N"], dtype: DTypeLike
+) -> Dynamics:
     """The transitions on the device, in the layout that their lists have; the one place where it is chosen."""
     if next_state.shape[2] == next_state.shape[0]:
         return DenseTensor(
@@ -106,7 +109,9 @@ def check_initial(initial: Float[ArrayLike, " S"] | None, num_states: int) -> Fl
 
 
 def check_features(
-    features: Float[ArrayLike, "S A K"] | Float[ArrayLike, "S K"] | None, allowed: Bool[np.ndarray, "S A"], dtype
+    features: Float[ArrayLike, "S A K"] | Float[ArrayLike, "S K"] | None,
+    allowed: Bool[np.ndarray, "S A"],
+    dtype: DTypeLike,
 ) -> Float[np.ndarray, "S A K"]:
     """Features per pair in the model's type, zero where an action is not allowed, or raises."""
     num_states, num_actions = allowed.shape

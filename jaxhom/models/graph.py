@@ -4,7 +4,10 @@ The layouts of `MDP` give every state and action the room of the widest: a singl
 makes them as large as a dense tensor. Here each state has as many entries as it has transitions.
 """
 
+from __future__ import annotations
+
 import functools
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
@@ -12,6 +15,9 @@ import scipy.sparse.csgraph
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 _MEMORY = "_host_graph"  # under which an instance of a model keeps its graph: no field, and so in no pytree
 
@@ -27,7 +33,7 @@ class HostGraph:
       refused: bool [S, A], the actions that a state lacks; None where every state has all.
     """
 
-    def __init__(self, mdp: MDP):
+    def __init__(self, mdp: MDP) -> None:
         self.num_states, self.num_actions, slots = mdp.next_state.shape
         self.dtype = mdp.dtype
         probability, next_state = np.asarray(mdp.probability), np.asarray(mdp.next_state)
@@ -39,8 +45,8 @@ class HostGraph:
         self.refused = ~np.asarray(mdp.allowed) if mdp.restricts_actions else None
 
     @functools.cached_property
-    def num_entries(self) -> np.ndarray:
-        """int64 [S]: how many transitions each state has."""
+    def num_entries(self) -> Int[np.ndarray, " S"]:
+        """How many transitions each state has."""
         return np.diff(self.start)
 
     @functools.cached_property
@@ -52,7 +58,7 @@ class HostGraph:
         counts = scipy.sparse.coo_array((np.ones(len(index[0]), np.int32), index), shape=(self.num_states,) * 2)
         return counts.tocsr().astype(bool)
 
-    def reach(self, states: np.ndarray, steps: int) -> scipy.sparse.csr_array:
+    def reach(self, states: Int[np.ndarray, " P"], steps: int) -> scipy.sparse.csr_array:
         """Boolean [P, S], sorted: row p marks the states within `steps` steps of states[p], itself included."""
         states = np.asarray(states, np.int64)
         ones, first = np.ones(len(states), bool), np.arange(len(states) + 1)
@@ -65,8 +71,8 @@ class HostGraph:
         rows.sort_indices()
         return rows
 
-    def entries_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The transitions of states [M], one state after the other: which of the M each belongs to, and its number."""
+    def entries_of(self, states: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " T"], Int[np.ndarray, " T"]]:
+        """The transitions of P states, one state after the other: which of the P each belongs to, and its number."""
         counts = self.num_entries[states]
         owner = np.repeat(np.arange(len(states), dtype=np.int64), counts)
         shift = self.start[states] - (np.cumsum(counts) - counts)
@@ -113,6 +119,6 @@ def reachable_within(mdp: MDP, steps: int) -> scipy.sparse.csr_array:
     return host_graph(mdp).reach(np.arange(mdp.num_states), steps)
 
 
-def steps_from(mdp: MDP, state: int) -> np.ndarray:
-    """Least number of steps by any actions from a state to every state, float [S]; infinite where none leads."""
+def steps_from(mdp: MDP, state: int) -> Float[np.ndarray, " S"]:
+    """Least number of steps by any actions from a state to every state; infinite where none leads."""
     return scipy.sparse.csgraph.dijkstra(host_graph(mdp).adjacency, indices=state, unweighted=True)

@@ -22,6 +22,7 @@ from jaxhom.models.edge_chains import ActionChains, Edges, OneLane, PolicyChain
 from jaxhom.models.padded_rows import MAX_UNROLLED_ACTIONS, PaddedRows, gather_sum, narrow_width, pad_rows
 
 if TYPE_CHECKING:
+    from jax.typing import DTypeLike
     from jaxtyping import Array, Bool, Float, Int
 
 
@@ -46,7 +47,7 @@ class SuccessorLists(Dynamics):
 
     @classmethod
     def from_host(
-        cls, next_state: Int[np.ndarray, "S A N"], probability: Float[np.ndarray, "S A N"], dtype
+        cls, next_state: Int[np.ndarray, "S A N"], probability: Float[np.ndarray, "S A N"], dtype: DTypeLike
     ) -> SuccessorLists:
         """The lists, with what the maps look up in them; rows ascend and repeat no successor."""
         num_states, _, slots = next_state.shape

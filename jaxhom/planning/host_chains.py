@@ -61,7 +61,7 @@ class HostModel:
         dense.
     """
 
-    def __init__(self, mdp: MDP):
+    def __init__(self, mdp: MDP) -> None:
         self.num_states, self.num_actions = mdp.num_states, mdp.num_actions
         self.discount = float(mdp.discount)
         pairs = self.num_states * self.num_actions
@@ -127,7 +127,7 @@ class HostModel:
 class HostChain:
     """One chain P_pi, factorised: solves with I - gamma P_pi and with its transpose."""
 
-    def __init__(self, transition: Float[np.ndarray, "S S"] | scipy.sparse.csr_array, discount: float):
+    def __init__(self, transition: Float[np.ndarray, "S S"] | scipy.sparse.csr_array, discount: float) -> None:
         self._discount = discount
         if not scipy.sparse.issparse(transition):
             self._transition = transition / _or_one(transition.sum(axis=1))[:, None]

@@ -431,3 +431,17 @@ def test_options_that_mean_nothing_are_refused(options, message):
     mdp = MDP.from_dense(np.ones((1, 1, 1)), discount=0.9)
     with pytest.raises(ValueError, match=message):
         optimal_policy(mdp, np.zeros((1, 1)), **options)
+
+
+def test_every_plan_says_how_it_ended():
+    """Concrete, in a program and lane by lane: solved, and stopped by the limit."""
+    case = small_models.case("dense")
+    rewards = np.stack([reward_of("dense"), -reward_of("dense")])
+
+    def statuses(limit):
+        plan = functools.partial(optimal_policy, case.mdp, tolerance=1e-9, max_iterations=limit)
+        return plan(rewards).status, jax.jit(plan)(rewards).status, jax.vmap(plan)(rewards).status
+
+    for limit, expected in ((100_000, Status.SOLVED), (1, Status.ITERATION_LIMIT)):
+        for status in statuses(limit):
+            assert status.tolist() == [expected] * 2

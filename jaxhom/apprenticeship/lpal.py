@@ -143,7 +143,7 @@ class LPAL:
 
     def __init__(self, mdp: MDP):
         self._mdp = as_model(mdp)
-        if not mdp.num_features:
+        if not self._mdp.num_features:
             raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
         concrete = without_tangents(self._mdp)
         _refuse_traced(concrete)

@@ -182,7 +182,7 @@ def _step(payoff, is_row, is_column, point):
     dw, dq, ds, dd, _, _ = direction(0.0, 0.0)
     length = longest_step((w, dw), (q, dq), (s, ds), (d, dd), most=_LONGEST)
     ahead = ((w + length * dw) @ (s + length * ds) + (q + length * dq) @ (d + length * dd)) / count
-    mu = mehrotra_target(mu, ahead, _LEAST_CENTRING)
+    mu = mehrotra_target(mu, ahead / mu, _LEAST_CENTRING)
     dw, dq, ds, dd, dv, dt = direction(mu - dw * ds, mu - dq * dd)
     length = longest_step((w, dw), (q, dq), (s, ds), (d, dd), to_boundary=_TO_BOUNDARY)
     moved = (w + length * dw, q + length * dq, v + length * dv, t + length * dt)

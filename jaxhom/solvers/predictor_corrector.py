@@ -34,33 +34,38 @@ def longest_step(
       to_boundary: share of the way to the first boundary, below 1 for points that are to stay positive.
     """
     numpy = _module_of(pairs[0][0])
-    # Of values that all grow the speed is 0; `most` is then no boundary, and is kept.
-    speeds = [numpy.where(change < 0, -change / value, 0.0).max(initial=0.0) for value, change in pairs]
-    fastest = numpy.stack(speeds).max() if len(speeds) > 1 else speeds[0]
-    return 1.0 / numpy.maximum(fastest / to_boundary, 1.0 / most)
+    steps = [_first_boundary(numpy, value, change) for value, change in pairs]
+    first = numpy.stack(steps).min() if len(steps) > 1 else steps[0]
+    return numpy.minimum(to_boundary * first, most)
+
+
+def _first_boundary(numpy: ModuleType, value, change):
+    """The step at which the first value is 0; infinite if none falls."""
+    is_falling = change < 0
+    return numpy.where(is_falling, -value / numpy.where(is_falling, change, -1.0), numpy.inf).min(initial=numpy.inf)
 
 
 def mehrotra_target(
-    mean: Float[Array, ""], ahead: Float[Array, ""], least: float = 0.0, most: float = 1.0
+    mean: Float[Array, ""], left: Float[Array, ""], least: float = 0.0, most: float = 1.0
 ) -> Float[Array, ""]:
-    """What products should become: their mean times (ahead / mean)^3, `ahead` being what the predictor leaves of it.
+    """What products should become: mean * left^3, where `left` is the share of them that the predictor leaves.
 
     Args:
-      mean, ahead: of the products, now and after the predictor.
+      mean: of the products.
+      left: the share.
       least: smallest factor; without one, products that nearly vanish leave the next step no room.
       most: largest factor. Above 1 only where points are not feasible yet, and products may have to grow first.
     """
-    numpy = _module_of(mean)
-    return mean * numpy.clip((ahead / mean) ** 3, least, most)
+    return mean * _module_of(mean).clip(left**3, least, most)
 
 
-def towards_centre(products: Float[Array, " n"], target: Float[Array, ""], spread: float) -> Float[Array, " n"]:
-    """What products lack to be within a factor `spread` of the target.
+def towards_centre(products: Float[Array, " n"], target: Float[Array, ""], even: float) -> Float[Array, " n"]:
+    """What products lack to be between the share `even` of the target and the target divided by it.
 
     Large ones are corrected by no more than the largest product that is wanted: more would undo the step.
     """
     numpy = _module_of(products)
-    low, high = target / spread, target * spread
+    low, high = even * target, target / even
     return numpy.maximum(numpy.clip(products, low, high) - products, -high)
 
 

@@ -27,7 +27,7 @@ _PATIENCE = 30  # steps without a smaller error, after which rounding has won
 _CORRECTORS = 3  # after Mehrotra's, at most
 _LONGER = 0.3  # what a corrector aims to add to the step
 _SOME = 0.03  # what it has to add to be kept
-_SPREAD = 10.0  # products within this factor of the target stay as they are
+_EVEN = 0.1  # products between this share of the target and its inverse stay as they are
 
 
 class InteriorPoint(Record):
@@ -152,14 +152,14 @@ def _step(rows: Rows, residuals, point: InteriorPoint) -> InteriorPoint:
 
     change = direction(-z * s, residuals)
     along, across = change.lengths(point)
-    ahead = (z + along * change.z) @ (s + across * change.s)
-    target = mehrotra_target((z @ s) / len(z), ahead / len(z), most=np.inf)
+    left = (z + along * change.z) @ (s + across * change.s) / (z @ s)
+    target = mehrotra_target((z @ s) / len(z), left, most=np.inf)
     change = direction(target - z * s - change.z * change.s, residuals)
     along, across = change.lengths(point)
     for _ in range(_CORRECTORS):
         further_along, further_across = min(1.0, along + _LONGER), min(1.0, across + _LONGER)
         products = (z + further_along * change.z) * (s + further_across * change.s)
-        corrected = change.corrected(direction(towards_centre(products, target, _SPREAD), nothing))
+        corrected = change.corrected(direction(towards_centre(products, target, _EVEN), nothing))
         longer_along, longer_across = corrected.lengths(point)
         if longer_along + longer_across < along + across + _SOME:
             break

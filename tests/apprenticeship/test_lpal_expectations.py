@@ -1,6 +1,5 @@
 """LPAL for expectations that no policy can reach, that contradict one another or have the wrong sign."""
 
-import dataclasses
 import functools
 
 import jax
@@ -180,7 +179,7 @@ def test_reduction_knows_that_rounded_rows_do_not_sum_to_one(rng):
     transition = np.float32(TRANSITION) * np.float32(1 - 9e-5)
     features = np.broadcast_to(np.arange(K) > 0, (S, A, K)).astype(float)
     mdp = MDP.from_dense(TRANSITION, discount=0.999, initial=INITIAL, features=features)
-    mdp = dataclasses.replace(mdp, probability=jnp.asarray(transition))  # constructors would bring the sums to 1
+    mdp = mdp._exchange({"probability": jnp.asarray(transition)})  # constructors would bring the sums to 1
     policy = small_models.random_policy(rng, S, A)
     reached = oracles.feature_expectations(transition.astype(float), 0.999, INITIAL, features, policy)
     expectations = 950.0 * (np.arange(K) > 0)  # out of reach, but not of 1 / (1 - discount)

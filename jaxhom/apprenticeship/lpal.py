@@ -137,7 +137,7 @@ class LPAL:
       >>> mdp = jaxhom.gridworld(4, num_regions=4).mdp
       >>> prepared = jaxhom.LPAL(mdp)
       >>> margins = [float(prepared.solve([vhat] * 4).margin) for vhat in (0.0, 10.0)]
-      >>> print(margins[0] - margins[1])
+      >>> print(round(margins[0] - margins[1], 3))
       10.0
     """
 

@@ -109,7 +109,7 @@ def lpal(
     Example:
       >>> import jaxhom
       >>> mdp = jaxhom.gridworld(4, num_regions=4).mdp
-      >>> expert = jaxhom.optimal_policy(mdp, mdp.features @ [0.0, 0.0, 0.0, 1.0])
+      >>> expert = jaxhom.optimal_policy(mdp, mdp.features[..., 3])
       >>> solution = jaxhom.lpal(mdp, jaxhom.feature_expectations(mdp, expert.policy), tolerance=0.01)
       >>> print(bool(solution.margin_bound - solution.margin <= 0.01))
       True

@@ -1,7 +1,7 @@
 """Another method for slow lanes of LPAL on columns, in a thread of its own while the other lanes go on with columns.
 
-The thread is for batches: in one of 16 lanes of `grid48` (bench/results/speed_lpal.csv) the other method has five, and
-its thread a third of the CPU time; one after the other, a core would stand idle for that long.
+The thread is for batches: in one of 16 lanes of `grid48` (bench/results/speed_lpal.csv) the other method has five. Its
+steps are many small calls that leave a core to spare, which columns can use; what that gains has not been measured.
 """
 
 from __future__ import annotations

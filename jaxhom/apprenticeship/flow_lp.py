@@ -128,7 +128,7 @@ class FlowProblem(Record):
         q = self._project_weights(q + step * (self.expectations / FEATURE_SCALE))
         return jnp.concatenate([jnp.maximum(multipliers, 0.0), q])
 
-    def project_dual(self, point: jax.Array, step) -> jax.Array:
+    def project_dual(self, point: jax.Array, step: jax.Array | None) -> jax.Array:
         """Onto the affine set A."""
         del step
         mdp = self.mdp
@@ -142,7 +142,9 @@ class FlowProblem(Record):
         x = self._allowed(x - change - jnp.stack(moved, axis=1))
         return jnp.concatenate([x.reshape(-1, x.shape[-1]), u + FEATURE_SCALE * on_features])
 
-    def bounds(self, primal, dual, forward, adjoint) -> tuple[jax.Array, jax.Array]:
+    def bounds(
+        self, primal: jax.Array, dual: jax.Array, forward: jax.Array, adjoint: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """None: certificates are made of policies and weights, outside the iteration."""
         del dual, forward, adjoint
         infinity = jnp.full(primal.shape[-1], jnp.inf, primal.dtype)

@@ -48,17 +48,17 @@ class MatrixGame(Record):
         """M q, [m, lanes] -> [K, lanes]."""
         return jnp.einsum("bkm,mb->kb", self.payoff, q)
 
-    def project_primal(self, point: jax.Array, step) -> jax.Array:
+    def project_primal(self, point: jax.Array, step: jax.Array | None) -> jax.Array:
         """Onto the simplex of the rows."""
         del step
         return project_simplex(point)
 
-    def project_dual(self, point: jax.Array, step) -> jax.Array:
+    def project_dual(self, point: jax.Array, step: jax.Array | None) -> jax.Array:
         """Onto the simplex of the columns that exist."""
         del step
         return jnp.where(self.is_column, project_simplex(jnp.where(self.is_column, point, _ABSENT)), 0.0)
 
-    def bounds(self, w, q, forward, adjoint) -> tuple[jax.Array, jax.Array]:
+    def bounds(self, w: jax.Array, q: jax.Array, forward: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Lower and upper bounds on the value; w and q are normalised to rounding."""
         columns = jnp.where(self.is_column, forward, -jnp.inf)
         return adjoint.min(axis=0), columns.max(axis=0)

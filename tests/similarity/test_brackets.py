@@ -5,7 +5,8 @@ import oracles
 import pytest
 
 from jaxhom import Status
-from jaxhom.similarity.brackets import METHODS, Goal, bracket_errors, lower_bounds_without_iterations
+from jaxhom.similarity.brackets import METHODS, Goal, bracket_errors
+from jaxhom.similarity.free_bounds import lower_bounds_without_iterations
 from jaxhom.solvers import lane_queue
 
 PAIRS = 24

@@ -1,4 +1,4 @@
-"""Bounds on the errors of LP (9) that cost no iterations: they decide most pairs of states that are clearly different."""
+"""Bounds on the errors of LP (9) that cost no iterations: they decide many pairs that are clearly different."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ interrupts.watch_while_loading()  # before the imports below, which take a secon
 from jaxhom.apprenticeship.lpal import LPAL, LPALSolution, lpal
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
+from jaxhom.domains.tile_map import TileMap
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
 from jaxhom.generalization.explanation import Explanation
 from jaxhom.generalization.neighbors import nearest_neighbors
@@ -56,6 +57,7 @@ __all__ = [
     "Racetrack",
     "SimilarityTable",
     "Status",
+    "TileMap",
     "agreement",
     "empirical_policy",
     "evaluate_by_sampling",

@@ -15,7 +15,7 @@ figures and words. The flow of a sweep, one module each:
                      `linear_programs` and `models` in their own form
     contest          rows of us and of the peers on one instance (`lpal_instances`, `planning_instances`)
     X_speed          draws instances, judges whoever solved them by one certificate
-    X_report         makes a table and a figure of the rows alone
+    speed_report     makes tables and figures of the rows alone
 """
 
 import os

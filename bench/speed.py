@@ -14,10 +14,9 @@ import csv
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Iterator
-from types import ModuleType
+from collections.abc import Callable, Iterator
 
-from bench import lpal_report, planning_report, similarity_report
+from bench import speed_report
 from bench.processes import NoAnswer, Worker
 from bench.provenance import RESULTS
 
@@ -31,7 +30,7 @@ class Kind:
       sections: all of them, in the order of the file; quick: those of a quick run.
       fields: the columns.
       shown: the fields that are printed while it runs.
-      report: has `table(rows)`, Markdown, and `figure(rows)`, None if there is nothing to draw.
+      table: rows -> Markdown. figure: rows -> figure, None if there is nothing to draw.
       has_methods: whether the user may choose methods and a limit.
     """
 
@@ -40,7 +39,8 @@ class Kind:
     quick: tuple[str, ...]
     fields: tuple[str, ...]
     shown: tuple[str, ...]
-    report: ModuleType
+    table: Callable
+    figure: Callable
     has_methods: bool = False
 
 
@@ -58,7 +58,8 @@ KINDS = {
             *("gflops", "peak_fraction", "gbytes_per_s", "status", "note", "versions", "commit"),
         ),
         shown=("work", "method", "dtype", "n", "pairs", "ms_per_pair"),
-        report=similarity_report,
+        table=speed_report.similarity_table,
+        figure=speed_report.similarity_figure,
     ),
     "lpal": Kind(
         title="LPAL, against other LP solvers",
@@ -73,12 +74,13 @@ KINDS = {
             *("status", "note", "versions", "commit"),
         ),
         shown=("method", "lanes", "seconds", "settled", "status", "note"),
-        report=lpal_report,
+        table=speed_report.lpal_table,
+        figure=speed_report.lpal_figure,
         has_methods=True,
     ),
     "planning": Kind(
         title="planning and occupancies, against MDP toolboxes and SciPy",
-        sections=planning_report.SECTIONS,
+        sections=("grid16", "grid32", "grid48", "grid100", "grid316", "racetrack_a", "garnet_dense", "garnet_sparse"),
         quick=("grid16", "garnet_sparse"),
         fields=(
             *("section", "instance", "work", "S", "A", "lanes", "method", "processes", "dtype", "device"),
@@ -86,7 +88,8 @@ KINDS = {
             *("status", "note", "versions", "commit"),
         ),
         shown=("work", "method", "lanes", "seconds", "settled", "status", "note"),
-        report=planning_report,
+        table=speed_report.planning_table,
+        figure=speed_report.planning_figure,
         has_methods=True,
     ),
 }
@@ -112,8 +115,8 @@ def run(arguments: argparse.Namespace) -> None:
 def report(kind: Kind, path: pathlib.Path) -> None:
     """The table and the figure, beside the CSV file."""
     rows = read(path)
-    path.with_suffix(".md").write_text(kind.report.table(rows))
-    figure = kind.report.figure(rows)
+    path.with_suffix(".md").write_text(kind.table(rows))
+    figure = kind.figure(rows)
     if figure is not None:
         figure.savefig(path.with_suffix(".png"), dpi=130)
 

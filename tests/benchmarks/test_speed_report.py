@@ -9,10 +9,9 @@ import pytest
 import scipy.optimize
 
 import jaxhom
-from bench import lp_peers, processes, speed, speed_report
+from bench import instances, lp_peers, processes, speed, speed_report
 from bench.linear_programs import Conic, Homomorphisms, Lpal
 from bench.lp_peers import Settings
-from bench.lpal_instances import INSTANCES, regions
 from bench.models import Model
 
 
@@ -87,8 +86,9 @@ def test_rows_of_other_sections_and_methods_stay():
 
 
 def test_kinds_name_their_sections():
-    assert set(speed.KINDS["lpal"].sections) == set(INSTANCES)
-    assert set(speed_report.OVER_STATES) <= set(INSTANCES)
+    assert set(speed.KINDS["lpal"].sections) == set(instances.LPAL)
+    assert set(speed_report.OVER_STATES) <= set(instances.LPAL)
+    assert set(speed.KINDS["planning"].sections) == set(instances.PLANNING)
     for kind in speed.KINDS.values():
         assert set(kind.quick) <= set(kind.sections) and len(set(kind.fields)) == len(kind.fields)
 
@@ -105,7 +105,7 @@ def test_committed_rows_have_the_fields(request):
 @pytest.fixture(scope="module")
 def small():
     """A small grid's model, and expectations that no policy quite reaches."""
-    mdp = regions(4, 4)
+    mdp = instances.regions(4, 4)
     expert = jaxhom.optimal_policy(mdp, mdp.features @ np.array([0.0, 0.2, 1.0, 0.1])).policy
     return mdp, np.asarray(jaxhom.feature_expectations(mdp, expert)) * np.array([1.1, 0.9, 1.05, 1.2])
 

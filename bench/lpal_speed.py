@@ -57,7 +57,7 @@ _PLANNING_SHARE = 0.002  # of the gap asked, that planning may add to the bound:
 _PACKAGES = ("jax", "moreau", "clarabel", "highspy", "ortools", "mpax", "scipy")
 
 
-def section(name: str, quick: bool, methods: list[str] | None, limit: float | None) -> Iterator[dict]:
+def section(name: str, quick: bool, methods: list[str] | None, limit: float) -> Iterator[dict]:
     """All rows of an instance, with `jaxhom.lpal`'s default tolerance as the gap that is asked for."""
     lanes = contest.QUICK_LANES if quick else OUR_LANES.get(name, contest.LANES)
     mdp, expectations = instances.LPAL[name].draw(SEED, lanes)

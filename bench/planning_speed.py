@@ -30,7 +30,7 @@ _MIXED = 0.1  # of the uniform policy, in the policies that are evaluated: every
 _PACKAGES = ("jax", "mdptoolbox-hiive", "mdpsolver", "quantecon", "scipy", "numpy")
 
 
-def section(name: str, quick: bool, methods: list[str] | None, limit: float | None) -> Iterator[dict]:
+def section(name: str, quick: bool, methods: list[str] | None, limit: float) -> Iterator[dict]:
     """All rows of an instance: ours, then each peer's, for each kind of work."""
     title, build, reward_of = instances.PLANNING[name]
     mdp = build()

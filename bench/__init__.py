@@ -13,9 +13,9 @@ figures and words. The flow of a sweep, one module each:
     processes        the protocol of whoever is measured, in a process with a time limit
     ours             this library under that protocol; `lp_peers` and `planning_peers` the others, which get
                      `linear_programs` and `models` in their own form
-    contest          rows of us and of the peers on one instance (`lpal_instances`, `planning_instances`)
+    contest          rows of us and of the peers on one instance (`instances`)
     X_speed          draws instances, judges whoever solved them by one certificate
-    X_report         makes a table and a figure of the rows alone
+    speed_report     makes tables and figures of the rows alone
 """
 
 import os

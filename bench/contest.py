@@ -17,7 +17,6 @@ import numpy as np
 
 from bench.processes import Found, NoAnswer, measure
 
-_LIMIT, _QUICK_LIMIT = 300.0, 60.0  # seconds for a row, so that all of them take hours and not days
 LANES, QUICK_LANES = 32, 4
 _SINGLE_LANES, _QUICK_SINGLE_LANES = 3, 1
 _FEWER_LANES = (8, 2)  # of a peer's batch that would take too long
@@ -36,7 +35,7 @@ class Contest:
       judge: (answers) -> fields that say how accurate they are, "settled" among them.
       least_tolerance: that peers are given.
       quick: whether it is to take minutes, not hours.
-      limit: seconds for one row, or None for what is usual.
+      limit: seconds for one row.
     """
 
     fields: dict
@@ -44,11 +43,7 @@ class Contest:
     judge: Callable[[list], dict]
     least_tolerance: float
     quick: bool
-    limit: float | None
-
-    def __post_init__(self):
-        if self.limit is None:
-            object.__setattr__(self, "limit", _QUICK_LIMIT if self.quick else _LIMIT)
+    limit: float
 
     @property
     def single(self) -> int:

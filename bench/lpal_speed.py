@@ -1,6 +1,6 @@
 """Measures LPAL by this library and by other solvers on the same instances, judged by one certificate.
 
-A section is an instance of `bench.lpal_instances`; how it is measured is `bench.contest`'s. The policy is read off x
+A section is an instance of `bench.instances.LPAL`; how it is measured is `bench.contest`'s. The policy is read off x
 (eq. 5; where the state hardly occurs, a best response to w). `Model.policy_solve`, none of our solvers, gives its
 occupancy and its margin min_k V_k(pi) - Vhat_k; planning for w gives the bound.
 """
@@ -16,10 +16,9 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import contest, lp_peers  # noqa: E402
+from bench import contest, instances, lp_peers  # noqa: E402
 from bench.linear_programs import Lpal  # noqa: E402
 from bench.lp_peers import Settings  # noqa: E402
-from bench.lpal_instances import INSTANCES  # noqa: E402
 from bench.models import Model  # noqa: E402
 from bench.provenance import provenance  # noqa: E402
 
@@ -58,13 +57,13 @@ _PLANNING_SHARE = 0.002  # of the gap asked, that planning may add to the bound:
 _PACKAGES = ("jax", "moreau", "clarabel", "highspy", "ortools", "mpax", "scipy")
 
 
-def section(name: str, quick: bool, methods: list[str] | None, limit: float | None) -> Iterator[dict]:
+def section(name: str, quick: bool, methods: list[str] | None, limit: float) -> Iterator[dict]:
     """All rows of an instance, with `jaxhom.lpal`'s default tolerance as the gap that is asked for."""
     lanes = contest.QUICK_LANES if quick else OUR_LANES.get(name, contest.LANES)
-    mdp, expectations = INSTANCES[name].draw(SEED, lanes)
+    mdp, expectations = instances.LPAL[name].draw(SEED, lanes)
     model = Model.of(mdp)
     gap = 1e-5 / (1.0 - model.discount) * float(jnp.abs(mdp.features).max())
-    fields = {"instance": INSTANCES[name].title, "S": mdp.num_states, "A": mdp.num_actions, "K": mdp.num_features}
+    fields = {"instance": instances.LPAL[name].title, "S": mdp.num_states, "A": mdp.num_actions, "K": mdp.num_features}
     fields |= {"dtype": "float64", "gap_asked": gap} | provenance(*_PACKAGES)
 
     def judge(answers: list) -> dict:

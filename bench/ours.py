@@ -11,7 +11,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import lpal_instances, planning_instances  # noqa: E402
+from bench import instances  # noqa: E402
 
 
 class _Solver:
@@ -47,7 +47,7 @@ def lpal(name: str, method: str | None, **_) -> _Solver:
     """LPAL on an instance; a lane is (expectations,), its answer (x, w)."""
     options = {} if method is None else {"method": method}
     return _Solver(
-        lpal_instances.INSTANCES[name].build(),
+        instances.LPAL[name].build(),
         lambda mdp, expectations: jaxhom.lpal(mdp, expectations, **options),
         lambda found: ((found.occupancy, found.weights), found.status, found.iterations),
     )
@@ -55,7 +55,7 @@ def lpal(name: str, method: str | None, **_) -> _Solver:
 
 def planning(name: str, work: str, tolerance: float, **_) -> _Solver:
     """Planning and evaluation on an instance; a lane is a reward and a policy, its answer that of `planning_peers`."""
-    mdp = planning_instances.build(name)
+    mdp = instances.PLANNING[name][1]()
     if work == "planning":
         return _Solver(
             mdp,

@@ -1,6 +1,6 @@
 """Measures planning, occupancies and values by this library and by others on the same instances.
 
-A section is an instance of `bench.planning_instances`; how it is measured is `bench.contest`'s. Planning is judged by
+A section is an instance of `bench.instances.PLANNING`; how it is measured is `bench.contest`'s. Planning is judged by
 the policy: its value, by `Model.policy_solve`, must lie within 1e-6 / (1 - discount) times the largest reward of an
 upper bound on the optimal one at every state. Occupancies and values must have a relative error of 1e-8 against that
 solve.
@@ -16,10 +16,9 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import contest, planning_peers  # noqa: E402
+from bench import contest, instances, planning_peers  # noqa: E402
 from bench.lp_peers import Settings  # noqa: E402
 from bench.models import Model  # noqa: E402
-from bench.planning_instances import TITLES, build, rewards  # noqa: E402
 from bench.provenance import provenance  # noqa: E402
 
 OURS = "jaxhom"
@@ -31,10 +30,12 @@ _MIXED = 0.1  # of the uniform policy, in the policies that are evaluated: every
 _PACKAGES = ("jax", "mdptoolbox-hiive", "mdpsolver", "quantecon", "scipy", "numpy")
 
 
-def section(name: str, quick: bool, methods: list[str] | None, limit: float | None) -> Iterator[dict]:
+def section(name: str, quick: bool, methods: list[str] | None, limit: float) -> Iterator[dict]:
     """All rows of an instance: ours, then each peer's, for each kind of work."""
-    mdp, count = build(name), contest.QUICK_LANES if quick else contest.LANES
-    model, drawn = Model.of(mdp), rewards(name, SEED, count)
+    title, build, reward_of = instances.PLANNING[name]
+    mdp = build()
+    model, lanes = Model.of(mdp), range(contest.QUICK_LANES if quick else contest.LANES)
+    drawn = np.stack([reward_of(mdp, SEED, lane) for lane in lanes])
     plans = [jaxhom.optimal_policy(mdp, reward) for reward in drawn]
     lanes = [
         (reward, (1.0 - _MIXED) * np.asarray(plan.policy) + _MIXED / mdp.num_actions)
@@ -46,7 +47,7 @@ def section(name: str, quick: bool, methods: list[str] | None, limit: float | No
     options = {"name": name, "tolerance": 0.5 * (1.0 - model.discount) * loss}
     for work in ("planning", "occupancy", "policy_value"):
         asked = loss if work == "planning" else _RELATIVE_ERROR
-        fields = {"instance": TITLES[name], "work": work, "S": mdp.num_states, "A": mdp.num_actions}
+        fields = {"instance": title, "work": work, "S": mdp.num_states, "A": mdp.num_actions}
         fields |= {"dtype": "float64", "error_asked": asked} | provenance(*_PACKAGES)
         judge = functools.partial(_judged, work, model, lanes, upper, asked)
         problem = contest.Contest(fields, lanes, judge, _LEAST_TOLERANCE * loss / _LOSS, quick, limit)

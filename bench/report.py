@@ -55,8 +55,7 @@ def _read(path: pathlib.Path) -> list[Row]:
 
 
 def _table1(rows: list[Row], folder: pathlib.Path) -> str:
-    cells = summaries.table1(rows)
-    summaries.write_csv(folder / "table1.csv", cells[list(summaries.TABLE1_COLUMNS)])
+    cells = summaries.write("table1", rows, folder)
     reward, ratio = tables.table1_reward(cells), tables.table1_ratio(cells)
     markdown = "\n\n".join(
         [
@@ -74,8 +73,7 @@ def _table1(rows: list[Row], folder: pathlib.Path) -> str:
 
 
 def _figure1(rows: list[Row], folder: pathlib.Path) -> str:
-    lines = summaries.figure1(rows)
-    summaries.write_csv(folder / "figure1.csv", lines)
+    lines = summaries.write("figure1", rows, folder)
     _save(figures.figure1(lines), folder / "figure1")
     words = comparison.figure1_words(comparison.compare_curves(rows))
     for track in dict.fromkeys(row.domain for row in rows):
@@ -92,8 +90,7 @@ def _question(name: str, title: str, draw: Callable, more: Callable[[pd.DataFram
     """The part of a question: its title, its figure, and what `more` says of its lines."""
 
     def part(rows: list[Row], folder: pathlib.Path) -> str:
-        lines = summaries.question(rows)
-        summaries.write_csv(folder / f"{name}.csv", lines)
+        lines = summaries.write(name, rows, folder)
         _save(draw(lines), folder / name)
         text = f"## {title}\n\n{_health(rows)}\n\n![{title}]({name}.png)"
         return text if more is None else f"{text}\n\n{more(lines)}"

@@ -84,9 +84,9 @@ def _run(name: str, work: Sweep, file: RowFile, options: argparse.Namespace) -> 
     """Runs one sweep, writes its summary, and returns how many of its rows have failed."""
     sweep.run(work, file, retry=options.retry)
     rows = [row for row in file.read() if row.seed == options.seed]
-    path, failed = options.output / f"{name}.csv", sum(bool(row.error) for row in rows)
-    summaries.write_csv(path, summaries.of_sweep(name, rows))
-    print(f"{path}: {len(rows)} rows, {failed} failed")
+    failed = sum(bool(row.error) for row in rows)
+    summaries.write(name, rows, options.output)
+    print(f"{options.output / name}.csv: {len(rows)} rows, {failed} failed")
     return failed
 
 

@@ -18,10 +18,7 @@ class Row:
     """One draw of one setting and method.
 
     Attributes:
-      domain: "grid16", "track_a" and the like. regions: K of a gridworld, 0 on tracks.
-      demonstrations, length: number of trajectories and their steps. trial: steps of a trial at most.
-      distance, threshold: d and epsilon of Algorithm 1. samples: transitions per state and action from which the
-        learner's model was estimated; 0 for the true model.
+      domain to samples: see `settings.Setting`.
       method: name. draw: number of the reward and demonstrations. seed: of the sweep.
       reward_per_step, steps, off_roads, finished: exact; see `jaxhom.Evaluation`. Empty where they do not apply.
       expert_reward: the expert's reward per step in the same draw.

@@ -6,6 +6,7 @@ is the median of three calls after a first one; `compile_s` is what the first to
 """
 
 import functools
+import itertools
 from collections.abc import Iterator
 
 import jax
@@ -19,7 +20,7 @@ import jaxhom  # noqa: E402
 from bench import lp_peers  # noqa: E402
 from bench.linear_programs import Conic, Homomorphisms  # noqa: E402
 from bench.lp_peers import Settings  # noqa: E402
-from bench.processes import Found, NoAnswer, measure, timed  # noqa: E402
+from bench.processes import NoAnswer, measure, timed  # noqa: E402
 from bench.provenance import provenance  # noqa: E402
 from jaxhom.generalization.global_lp import GlobalHomomorphismProblem  # noqa: E402
 from jaxhom.similarity.brackets import Goal, bracket_errors  # noqa: E402
@@ -62,9 +63,10 @@ def row(work: str, method: str, pairs: int, seconds: float | None = None, **fiel
     return base | provenance(*_PACKAGES) | fields
 
 
-def ready(call):
-    """A call that returns when its answer is there."""
-    return lambda: jax.block_until_ready(call())
+def clocked(call, repeats: int = 3) -> tuple:
+    """(result, seconds of the first call, median of the next ones, a field of what the first took beyond them)."""
+    result, first, seconds = timed(lambda: jax.block_until_ready(call()), repeats)
+    return result, first, seconds, {"compile_s": max(first - seconds, 0.0)} if repeats else {}
 
 
 def sizes(n: int, m: int | None = None, actions: int = NUM_ACTIONS) -> dict:
@@ -120,15 +122,10 @@ def our_pairs(n: int, count: int, method: str, dtype=np.float64, threshold=np.na
     """Brackets or decisions of random pairs."""
     source, target = random_pairs(n, count, dtype)
     goal = Goal(tolerance=GAP, threshold=threshold, method=method)
-
-    def call():
-        return bracket_errors(source, target, goal=goal)
-
-    found, first, seconds = timed(ready(call))
-    fields = sizes(n) | {"dtype": np.dtype(dtype).name, "compile_s": max(first - seconds, 0.0)}
-    return row(
-        work, f"jaxhom {method}", count, seconds, **fields, **judged(found.lower, found.upper, threshold=threshold)
-    )
+    found, _, seconds, compiling = clocked(lambda: bracket_errors(source, target, goal=goal))
+    fields = sizes(n) | compiling | {"dtype": np.dtype(dtype).name}
+    fields |= judged(found.lower, found.upper, threshold=threshold)
+    return row(work, f"jaxhom {method}", count, seconds, **fields)
 
 
 def section_brackets(quick: bool) -> Iterator[dict]:
@@ -144,9 +141,8 @@ def section_counts(quick: bool) -> Iterator[dict]:
     """Random pairs of five states, few and many."""
     for count in (8,) if quick else OUR_COUNTS:
         yield our_pairs(5, count, "auto", work="counts")
-    for method in ("highs_simplex", "moreau"):
-        for count in () if quick else PEER_COUNTS:
-            yield peer_pairs(method, 5, count, "counts")
+    for method, count in () if quick else itertools.product(("highs_simplex", "moreau"), PEER_COUNTS):
+        yield peer_pairs(method, 5, count, "counts")
 
 
 def section_decisions(quick: bool) -> Iterator[dict]:
@@ -162,11 +158,11 @@ def section_gradients(quick: bool) -> Iterator[dict]:
 
     def measured(method, value, asked):
         function = jax.jit(jax.vmap(jax.value_and_grad(value, argnums=(0, 1))))
-        (found, _), first, seconds = timed(ready(lambda: function(source, target)))
+        (found, _), _, seconds, compiling = clocked(lambda: function(source, target))
         away = float(np.maximum(np.maximum(exact.lower - found, found - exact.upper), 0.0).max())
-        fields = sizes(5) | {"gap_certified": away, "settled": 1.0, "gap_asked": asked}
-        fields |= {"compile_s": max(first - seconds, 0.0), "note": "gap: distance of the value from a bracket of 1e-6"}
-        return row("value and gradient", method, len(source), seconds, **fields)
+        fields = sizes(5) | compiling | {"gap_certified": away, "settled": 1.0, "gap_asked": asked}
+        note = "gap: distance of the value from a bracket of 1e-6"
+        return row("value and gradient", method, len(source), seconds, **fields, note=note)
 
     yield measured("jaxhom", jaxhom.homomorphism_error, 1e-6)
     if not quick and lp_peers.is_installed("moreau"):
@@ -198,30 +194,31 @@ def _moreau_error(n: int, gap: float):
 # -------------------------------------------------------------------------------------------------------------- peers
 
 
-def solved(method: str, pairs: list, settings: Settings, anchored: bool, processes: int) -> Found:
-    """LPs (8) or (9) of pairs of models by a peer."""
-    make = functools.partial(Homomorphisms, *pairs[0], anchored)
-    options = {"method": method, "settings": settings, "make": make}
-    package, together = lp_peers.PEERS[method][0], method in ("moreau", "mpax")
-    return measure("lp_peers:Opened", options, pairs, _LIMIT, package=package, together=together, processes=processes)
+def peer_row(work: str, method: str, pairs: list, settings: Settings, problem, processes: int, **fields) -> dict:
+    """LPs (8) or (9) of pairs of models by a peer, certified by `problem`, which is ours and says which of the two."""
+    anchored = isinstance(problem, HomomorphismProblem)
+    options = {"method": method, "settings": settings, "make": functools.partial(Homomorphisms, *pairs[0], anchored)}
+    how = {"package": lp_peers.PEERS[method][0], "together": method in ("moreau", "mpax"), "processes": processes}
+    fields = {"device": "cpu", "gap_asked": GAP} | fields
+    try:
+        found = measure("lp_peers:Opened", options, pairs, _LIMIT, **how)
+        if len(found.answers) < len(pairs):
+            raise NoAnswer("time limit", f"{len(found.answers)} of {len(pairs)} pairs in {_LIMIT:g} s")
+    except NoAnswer as error:  # a row, not the end of the benchmark
+        return row(work, method, len(pairs), **fields | error.fields)
+    fields |= {"processes": found.processes, "compile_s": found.compile_s, "build_s": found.build_s}
+    fields |= {"note": ", ".join([*filter(None, [fields.get("note")]), *sorted(set(found.words))])}
+    fields |= judged(*certified(problem, found.answers, anchored), asked=fields["gap_asked"])
+    return row(work, method, len(pairs), found.build_s + sum(found.seconds), **fields)
 
 
 def peer_pairs(method: str, n: int, count: int, work: str = "brackets") -> dict:
-    """Brackets of random pairs by a peer, certified by us."""
-    fields = sizes(n) | {"device": "cpu"}
+    """Brackets of random pairs by a peer."""
     if not lp_peers.is_installed(method):
-        return row(work, method, 0, **fields, status="not installed")
-    source, target = random_pairs(n, count)
-    pairs, processes = list(zip(source, target, strict=True)), 1 if method in lp_peers.USES_BOTH_CORES else 2
-    try:
-        found = solved(method, pairs, PEERS[method], anchored=True, processes=processes)
-        if len(found.answers) < count:
-            raise NoAnswer("time limit", f"{len(found.answers)} of {count} pairs in {_LIMIT:g} s")
-    except NoAnswer as error:  # a row, not the end of the benchmark
-        return row(work, method, count, **fields, **error.fields)
-    fields |= {"processes": found.processes, "compile_s": found.compile_s, "build_s": found.build_s}
-    fields |= judged(*certified(pair_problem(source, target), found.answers, anchored=True))
-    return row(work, method, count, found.build_s + sum(found.seconds), **fields)
+        return row(work, method, 0, **sizes(n), device="cpu", status="not installed")
+    models = random_pairs(n, count)
+    pairs, processes = list(zip(*models, strict=True)), 1 if method in lp_peers.USES_BOTH_CORES else 2
+    return peer_row(work, method, pairs, PEERS[method], pair_problem(*models), processes, **sizes(n))
 
 
 def section_peers(quick: bool) -> Iterator[dict]:
@@ -238,8 +235,8 @@ def section_peers(quick: bool) -> Iterator[dict]:
 
 def cold_and_warm(work: str, method: str, pairs: int, call, describe, repeats: int = 3) -> list[dict]:
     """Rows of the first call in this process and, if it is repeated, of the median of the next."""
-    result, cold, seconds = timed(ready(call), repeats)
-    fields = describe(result) | ({"compile_s": max(cold - seconds, 0.0)} if repeats else {})
+    result, cold, seconds, compiling = clocked(call, repeats)
+    fields = describe(result) | compiling
     rows = [row(f"{work}, cold", method, pairs, cold, **fields)]
     return rows + [row(f"{work}, warm", method, pairs, seconds, **fields)] * bool(repeats)
 
@@ -320,19 +317,14 @@ def our_global(size: int, mdp, demonstrations, repeats: int, **options) -> list[
 
 def highs_global(size: int, mdp, demonstrations) -> dict:
     """LP (8) by HiGHS's interior point, certified by us."""
-    method, settings = "highs_interior_point", Settings(0.1 * GLOBAL_GAP, _TIGHT)
     experts = np.unique(np.asarray(demonstrations.states)[np.asarray(demonstrations.mask)])
     restricted = restricted_model(mdp, experts)
-    fields = sizes(mdp.num_states, len(experts), mdp.num_actions) | {"gap_asked": GLOBAL_GAP, "device": "cpu"}
-    try:
-        found = solved(method, [(np.asarray(mdp.transition), restricted)], settings, anchored=False, processes=1)
-    except NoAnswer as error:
-        return row("LP (8), cold", method, 1, **fields, **error.fields)
-    fields |= {"build_s": found.build_s, "note": f"{size} x {size} grid, one process, {found.words[0]}"}
     pinned = jnp.zeros((mdp.num_states, len(experts)), bool)
     problem = GlobalHomomorphismProblem(mdp=mdp, restricted=jnp.asarray(restricted), pinned=pinned)
-    fields |= judged(*certified(problem, found.answers, anchored=False), asked=GLOBAL_GAP)
-    return row("LP (8), cold", method, 1, found.build_s + sum(found.seconds), **fields)
+    pairs, settings = [(np.asarray(mdp.transition), restricted)], Settings(0.1 * GLOBAL_GAP, _TIGHT)
+    fields = sizes(mdp.num_states, len(experts), mdp.num_actions) | {"gap_asked": GLOBAL_GAP}
+    fields |= {"note": f"{size} x {size} grid, one process"}
+    return peer_row("LP (8), cold", "highs_interior_point", pairs, settings, problem, 1, **fields)
 
 
 # --------------------------------------------------------------------------------------------- floating-point peak
@@ -344,10 +336,9 @@ def section_peak(quick: bool) -> Iterator[dict]:
     for dtype in (np.float64, np.float32):
         matrix = jnp.asarray(np.random.default_rng(0).random((size, size)), dtype)
         product = jax.jit(lambda a: a @ a)
-        _, first, seconds = timed(ready(lambda matrix=matrix, product=product: product(matrix)))
+        _, _, seconds, compiling = clocked(functools.partial(product, matrix))
         peak = 2.0 * size**3 / seconds
-        fields = {"dtype": np.dtype(dtype).name, "compile_s": max(first - seconds, 0.0)}
-        fields |= {"gflops": peak / 1e9, "gap_asked": None}
+        fields = compiling | {"dtype": np.dtype(dtype).name, "gflops": peak / 1e9, "gap_asked": None}
         yield row("peak", f"matrix product of {size}", 1, seconds, **fields)
         for n in (5,) if quick else SIZES:
             yield _iteration(n, dtype, peak)
@@ -357,8 +348,8 @@ def _iteration(n: int, dtype, peak: float, lanes: int = 64, calls: int = 20) -> 
     """One iteration of a batch of PDHG lanes, from calls of `pdhg.step`: enough of them for the clock."""
     problem = pair_problem(*random_pairs(n, lanes, dtype))
     state, step = pdhg.init(problem), jax.jit(pdhg.step)
-    _, first, seconds = timed(lambda: [step(problem, state).lower.block_until_ready() for _ in range(calls)])
-    fields = sizes(n) | {"dtype": np.dtype(dtype).name, "compile_s": max(first - seconds, 0.0)}
+    _, _, seconds, compiling = clocked(lambda: [step(problem, state).lower.block_until_ready() for _ in range(calls)])
+    fields = sizes(n) | compiling | {"dtype": np.dtype(dtype).name}
     seconds /= calls * pdhg.STEPS_PER_CHECK
     flops = 4.0 * n * NUM_ACTIONS * n * (n + n) * lanes
     # Both models for K and for K^T; the iterate read, its anchor read, the next written.

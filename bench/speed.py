@@ -14,10 +14,9 @@ import csv
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Iterator
-from types import ModuleType
+from collections.abc import Callable, Iterator
 
-from bench import lpal_report, planning_report, similarity_report
+from bench import speed_report
 from bench.processes import NoAnswer, Worker
 from bench.provenance import RESULTS
 
@@ -30,8 +29,7 @@ class Kind:
       title: for the command line's help.
       sections: all of them, in the order of the file; quick: those of a quick run.
       fields: the columns.
-      shown: the fields that are printed while it runs.
-      report: has `table(rows)`, Markdown, and `figure(rows)`, None if there is nothing to draw.
+      table: rows -> Markdown. figure: rows -> figure, None if there is nothing to draw.
       has_methods: whether the user may choose methods and a limit.
     """
 
@@ -39,8 +37,8 @@ class Kind:
     sections: tuple[str, ...]
     quick: tuple[str, ...]
     fields: tuple[str, ...]
-    shown: tuple[str, ...]
-    report: ModuleType
+    table: Callable
+    figure: Callable
     has_methods: bool = False
 
 
@@ -57,8 +55,8 @@ KINDS = {
             *("gap_asked", "gap_certified", "settled", "compile_s", "build_s", "seconds", "ms_per_pair"),
             *("gflops", "peak_fraction", "gbytes_per_s", "status", "note", "versions", "commit"),
         ),
-        shown=("work", "method", "dtype", "n", "pairs", "ms_per_pair"),
-        report=similarity_report,
+        table=speed_report.similarity_table,
+        figure=speed_report.similarity_figure,
     ),
     "lpal": Kind(
         title="LPAL, against other LP solvers",
@@ -72,24 +70,29 @@ KINDS = {
             *("seconds", "compile_s", "build_s", "gap_asked", "gap_certified", "settled", "iterations"),
             *("status", "note", "versions", "commit"),
         ),
-        shown=("method", "lanes", "seconds", "settled", "status", "note"),
-        report=lpal_report,
+        table=speed_report.lpal_table,
+        figure=speed_report.lpal_figure,
         has_methods=True,
     ),
     "planning": Kind(
         title="planning and occupancies, against MDP toolboxes and SciPy",
-        sections=planning_report.SECTIONS,
+        sections=("grid16", "grid32", "grid48", "grid100", "grid316", "racetrack_a", "garnet_dense", "garnet_sparse"),
         quick=("grid16", "garnet_sparse"),
         fields=(
             *("section", "instance", "work", "S", "A", "lanes", "method", "processes", "dtype", "device"),
             *("seconds", "compile_s", "build_s", "error_asked", "error", "settled", "iterations"),
             *("status", "note", "versions", "commit"),
         ),
-        shown=("work", "method", "lanes", "seconds", "settled", "status", "note"),
-        report=planning_report,
+        table=speed_report.planning_table,
+        figure=speed_report.planning_figure,
         has_methods=True,
     ),
 }
+
+
+_LIMIT, _QUICK_LIMIT = 300.0, 60.0  # seconds for a row, so that all of them take hours and not days
+# Fields that are printed while it runs, where a row has them.
+_PRINTED = ("work", "method", "dtype", "n", "pairs", "lanes", "ms_per_pair", "seconds", "settled", "status", "note")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -98,7 +101,8 @@ def run(arguments: argparse.Namespace) -> None:
     if not arguments.report:
         wanted = arguments.sections or (kind.quick if arguments.quick else kind.sections)
         rows = read(path) if path.exists() and (arguments.sections or methods) else []
-        options = {"quick": arguments.quick, "methods": methods, "limit": arguments.limit}
+        limit = arguments.limit or (_QUICK_LIMIT if arguments.quick else _LIMIT)
+        options = {"quick": arguments.quick, "methods": methods, "limit": limit}
         for section in wanted:
             print(section, file=sys.stderr, flush=True)
             rows = replace_rows(rows, section, methods)
@@ -112,8 +116,8 @@ def run(arguments: argparse.Namespace) -> None:
 def report(kind: Kind, path: pathlib.Path) -> None:
     """The table and the figure, beside the CSV file."""
     rows = read(path)
-    path.with_suffix(".md").write_text(kind.report.table(rows))
-    figure = kind.report.figure(rows)
+    path.with_suffix(".md").write_text(kind.table(rows))
+    figure = kind.figure(rows)
     if figure is not None:
         figure.savefig(path.with_suffix(".png"), dpi=130)
 
@@ -124,7 +128,12 @@ def measure(kind: str, section: str, options: dict) -> Iterator[dict]:
     with contextlib.closing(Worker(f"bench.{kind}_speed", "section", arguments)) as worker:
         try:
             while (row := worker.receive()) is not None:
-                print("  ", *(_short(row.get(name, "")) for name in KINDS[kind].shown), file=sys.stderr, flush=True)
+                print(
+                    "  ",
+                    *(_short(row[name]) for name in _PRINTED if row.get(name) is not None),
+                    file=sys.stderr,
+                    flush=True,
+                )
                 yield {"section": section} | row
         except NoAnswer as error:
             yield {"section": section} | error.fields

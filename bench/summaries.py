@@ -121,11 +121,12 @@ def question(rows: Iterable[Row]) -> pd.DataFrame:
     return lines(rows, QUESTION_KEY, (*METRICS, "ratio"))
 
 
-def of_sweep(name: str, rows: Iterable[Row]) -> pd.DataFrame:
-    """The summary file of a sweep."""
-    if name == "table1":
-        return table1(rows)[list(TABLE1_COLUMNS)]
-    return figure1(rows) if name == "figure1" else question(rows)
+def write(name: str, rows: Iterable[Row], folder: pathlib.Path) -> pd.DataFrame:
+    """Writes the summary file of a sweep, numbers to six digits, and returns its lines."""
+    found = {"table1": table1, "figure1": figure1}.get(name, question)(rows)
+    columns = list(TABLE1_COLUMNS) if name == "table1" else None
+    found.to_csv(folder / f"{name}.csv", columns=columns, index=False, float_format="%.6g", lineterminator="\n")
+    return found
 
 
 def lines(rows: Iterable[Row], by: Sequence[str], metrics: Sequence[str]) -> pd.DataFrame:
@@ -137,8 +138,3 @@ def lines(rows: Iterable[Row], by: Sequence[str], metrics: Sequence[str]) -> pd.
         if group[metric].notna().all()
     ]
     return pd.DataFrame(found, columns=[*by, "metric", "draws", *_INTERVAL])
-
-
-def write_csv(path: pathlib.Path, found: pd.DataFrame) -> None:
-    """Writes lines; numbers to six digits."""
-    found.to_csv(path, index=False, float_format="%.6g", lineterminator="\n")

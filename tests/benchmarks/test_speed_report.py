@@ -9,10 +9,9 @@ import pytest
 import scipy.optimize
 
 import jaxhom
-from bench import lp_peers, lpal_report, planning_report, processes, speed
+from bench import instances, lp_peers, processes, speed, speed_report
 from bench.linear_programs import Conic, Homomorphisms, Lpal
 from bench.lp_peers import Settings
-from bench.lpal_instances import INSTANCES, regions
 from bench.models import Model
 
 
@@ -45,9 +44,9 @@ def lpal_path(tmp_path):
 
 def test_ratios_are_to_the_best_settled_peer_of_the_same_column(lpal_path):
     rows = speed.read(lpal_path)
-    best = lpal_report.best_peers(rows)
+    best = speed_report.lpal_best_peers(rows)
     assert best == {("grid16", False): 0.4, ("grid16", True): 0.1, ("grid48", False): 9.0, ("grid48", True): 9.0}
-    table = lpal_report.table(rows)
+    table = speed_report.lpal_table(rows)
     line = {text.split(" | ")[0].strip("| "): text for text in table.splitlines() if text.startswith("| ")}
     assert "| 0.2 | 0.1 | 2 times | 32 | 0.01 | 0.1 | 10 times |" in table
     assert "| 3 | 0.1 | 3 times |" in table
@@ -56,7 +55,7 @@ def test_ratios_are_to_the_best_settled_peer_of_the_same_column(lpal_path):
 
 
 def test_curves_hold_settled_rows_by_states(lpal_path):
-    found = lpal_report.curves(speed.read(lpal_path))
+    found = speed_report.lpal_curves(speed.read(lpal_path))
     assert found["jaxhom", False] == [(256, 0.2), (2304, 3.0)]
     assert found["moreau", True] == [(256, 0.1)]
     assert not any(method in ("clarabel", "mpax") for method, _ in found)
@@ -69,7 +68,7 @@ def test_report_writes_table_and_figure(kind, lpal_path, tmp_path, monkeypatch):
         rows = [
             {"section": "grid16", "instance": "a grid", "work": work, "S": 256, "lanes": lanes, "method": method}
             | {"seconds": 0.5, "status": "measured", "settled": 1.0, "error": 1e-9}
-            for work, lanes, method in itertools.product(planning_report.WORKS, (1, 32), ("jaxhom", "another"))
+            for work, lanes, method in itertools.product(speed_report.WORKS, (1, 32), ("jaxhom", "another"))
         ]
         path = tmp_path / "planning.csv"
         speed.write(path, rows, speed.KINDS["planning"].fields)
@@ -87,8 +86,9 @@ def test_rows_of_other_sections_and_methods_stay():
 
 
 def test_kinds_name_their_sections():
-    assert set(speed.KINDS["lpal"].sections) == set(INSTANCES)
-    assert set(lpal_report.OVER_STATES) <= set(INSTANCES)
+    assert set(speed.KINDS["lpal"].sections) == set(instances.LPAL)
+    assert set(speed_report.OVER_STATES) <= set(instances.LPAL)
+    assert set(speed.KINDS["planning"].sections) == set(instances.PLANNING)
     for kind in speed.KINDS.values():
         assert set(kind.quick) <= set(kind.sections) and len(set(kind.fields)) == len(kind.fields)
 
@@ -105,7 +105,7 @@ def test_committed_rows_have_the_fields(request):
 @pytest.fixture(scope="module")
 def small():
     """A small grid's model, and expectations that no policy quite reaches."""
-    mdp = regions(4, 4)
+    mdp = instances.regions(4, 4)
     expert = jaxhom.optimal_policy(mdp, mdp.features @ np.array([0.0, 0.2, 1.0, 0.1])).policy
     return mdp, np.asarray(jaxhom.feature_expectations(mdp, expert)) * np.array([1.1, 0.9, 1.05, 1.2])
 

@@ -1,12 +1,15 @@
-"""Instances of LPAL by name: a model and the feature expectations of B experts, one per lane.
+"""Instances by name: of LPAL a model and the feature expectations of B experts, of planning a model and B rewards.
 
-Every lane has a reward of its own, the expert that is optimal for it, and its own errors. The expectations of the
-expert are either exact, or averages over a few demonstrations (Monte Carlo), or *perturbed*: exact, and each feature's
-multiplied by a number uniform on [0.8, 1.2], as if estimated from little data. All follow from a seed; a smaller number
-of lanes is a prefix of a larger one. Discount 0.99, float64 (the caller enables `jax_enable_x64`).
+Every lane of LPAL has a reward of its own, the expert that is optimal for it, and its own errors. The expectations of
+the expert are either exact, or averages over a few demonstrations (Monte Carlo), or *perturbed*: exact, and each
+feature's multiplied by a number uniform on [0.8, 1.2], as if estimated from little data. Planning has the paper's
+rewards, and on Garnets (random models) rewards uniform on [0, 1]; its models have features only where rewards need it.
+All follow from a seed; a smaller number of lanes is a prefix of a larger one. Discount 0.99, float64 (the caller
+enables `jax_enable_x64`).
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -26,7 +29,7 @@ _TRACK_WEIGHTS = np.array([5.0, 200.0])  # on the road, at the finish (Boularias
 
 @dataclasses.dataclass(frozen=True)
 class Instance:
-    """How an instance is drawn.
+    """How an instance of LPAL is drawn.
 
     Attributes:
       title: what tables call it.
@@ -67,12 +70,16 @@ class Instance:
 # ------------------------------------------------------------------------------------------------------------- models
 
 
+def grid(size: int) -> jaxhom.MDP:
+    """A grid without features."""
+    return jaxhom.gridworld(size, discount=DISCOUNT, dtype=np.float64).mdp
+
+
 def regions(size: int, num_regions: int) -> jaxhom.MDP:
     """A grid with indicators of square regions, as even as its size allows."""
-    world = jaxhom.gridworld(size, discount=DISCOUNT, dtype=np.float64)
-    features = jnp.asarray(region_of(size, num_regions)[:, None] == np.arange(num_regions), float)
-    shape = (world.mdp.num_states, world.mdp.num_actions, num_regions)
-    return world.mdp.replace(features=jnp.broadcast_to(features[:, None], shape))
+    return _with_features(
+        grid(size), np.asarray(region_of(size, num_regions)[:, None] == np.arange(num_regions), float)
+    )
 
 
 def region_of(size: int, num_regions: int) -> np.ndarray:
@@ -84,13 +91,17 @@ def region_of(size: int, num_regions: int) -> np.ndarray:
 
 def bumps(size: int) -> jaxhom.MDP:
     """A grid with Gaussian bumps on a lattice of 8 x 8 cells, as wide as the lattice's spacing."""
-    world = jaxhom.gridworld(size, discount=DISCOUNT, dtype=np.float64)
     spacing = size / _BUMPS_PER_SIDE
     line = (np.arange(_BUMPS_PER_SIDE) + 0.5) * spacing - 0.5
-    centres = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-    squares = ((np.asarray(world.coordinates)[:, None] - centres) ** 2).sum(axis=-1)
-    features = jnp.asarray(np.exp(-0.5 * squares / spacing**2))
-    return world.mdp.replace(features=jnp.repeat(features[:, None], world.mdp.num_actions, axis=1))
+    centres, cells = (np.stack(np.meshgrid(at, at, indexing="ij"), -1).reshape(-1, 2) for at in (line, np.arange(size)))
+    squares = ((cells[:, None] - centres) ** 2).sum(axis=-1)
+    return _with_features(grid(size), np.exp(-0.5 * squares / spacing**2))
+
+
+def _with_features(mdp: jaxhom.MDP, of_states: np.ndarray) -> jaxhom.MDP:
+    """A model with features [S, K], the same for every action."""
+    shape = (mdp.num_states, mdp.num_actions, of_states.shape[1])
+    return mdp.replace(features=jnp.broadcast_to(jnp.asarray(of_states)[:, None], shape))
 
 
 def track(name: str) -> jaxhom.MDP:
@@ -98,23 +109,24 @@ def track(name: str) -> jaxhom.MDP:
     return jaxhom.racetrack(name, discount=DISCOUNT, dtype=np.float64).mdp
 
 
-def dense_garnet(num_states: int = 500, num_features: int = 32) -> jaxhom.MDP:
-    """Every state follows every pair, rows uniform on the simplex; features uniform on [0, 1]."""
-    rng = np.random.default_rng([0, num_states])
+def dense_garnet() -> jaxhom.MDP:
+    """Every state follows every pair, rows uniform on the simplex; 32 features uniform on [0, 1]."""
+    rng, num_states = np.random.default_rng([0, 500]), 500
     transition = rng.dirichlet(np.ones(num_states), (num_states, NUM_ACTIONS))
-    features = rng.random((num_states, NUM_ACTIONS, num_features))
+    features = rng.random((num_states, NUM_ACTIONS, 32))
     return jaxhom.MDP.from_dense(transition, discount=DISCOUNT, features=features)
 
 
-def sparse_garnet(num_states: int, successors: int = 5) -> jaxhom.MDP:
-    """Random successors for every pair, their probabilities uniform on the simplex; no features."""
+def sparse_garnet() -> jaxhom.MDP:
+    """Five random successors for every pair, their probabilities uniform on the simplex; no features."""
+    num_states, successors = 10_000, 5
     rng = np.random.default_rng([0, num_states, successors])
     next_state = rng.integers(num_states, size=(num_states, NUM_ACTIONS, successors))
     probability = rng.dirichlet(np.ones(successors), (num_states, NUM_ACTIONS))
     return jaxhom.MDP.from_successors(next_state, probability, discount=DISCOUNT)
 
 
-# ------------------------------------------------------------------------------------------------------------ experts
+# ------------------------------------------------------------------------------------------------------------ rewards
 
 
 def region_weights(seed: int, lane: int, num_regions: int) -> np.ndarray:
@@ -127,24 +139,29 @@ def track_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
     return _TRACK_WEIGHTS * np.random.default_rng([seed, lane]).uniform(0.5, 1.5, num_features)
 
 
-def _positive_weights(seed: int, lane: int, num_features: int) -> np.ndarray:
-    return np.random.default_rng([seed, lane]).random(num_features)
+def uniform(seed: int, lane: int, shape) -> np.ndarray:
+    """Weights or rewards uniform on [0, 1]."""
+    return np.random.default_rng([seed, lane]).random(shape)
+
+
+# ------------------------------------------------------------------------------------------------------------- tables
 
 
 def _regions(size: int, num_regions: int, expectations: str = "perturbed", horizon: int = 0) -> Instance:
     title = f"{size}x{size}, {num_regions} regions, {expectations.replace('_', ' ')}"
-    return Instance(title, lambda: regions(size, num_regions), region_weights, expectations, horizon)
+    return Instance(title, functools.partial(regions, size, num_regions), region_weights, expectations, horizon)
 
 
 def _bumps(size: int) -> Instance:
-    return Instance(f"{size}x{size}, 64 bumps, perturbed", lambda: bumps(size), _positive_weights)
+    return Instance(f"{size}x{size}, 64 bumps, perturbed", functools.partial(bumps, size), uniform)
 
 
 def _track(name: str) -> Instance:
-    return Instance(f"racetrack {name}, Monte Carlo", lambda: track(name), track_weights, "monte_carlo", 30)
+    title = f"racetrack {name}, Monte Carlo"
+    return Instance(title, functools.partial(track, name), track_weights, "monte_carlo", horizon=30)
 
 
-INSTANCES = {
+LPAL = {
     "grid16": _regions(16, 64),
     "grid16_exact": _regions(16, 64, "exact"),
     "grid16_monte_carlo": _regions(16, 64, "monte_carlo", 50),
@@ -157,7 +174,32 @@ INSTANCES = {
     "bumps48": _bumps(48),
     "grid100": _regions(100, 100),
     "grid316": _regions(316, 100),
-    "garnet": Instance("dense Garnet, S = 500, K = 32", dense_garnet, _positive_weights),
+    "garnet": Instance("dense Garnet, S = 500, K = 32", dense_garnet, uniform),
     "racetrack_a": _track("a"),
     "racetrack_b": _track("b"),
+}
+
+
+def _grid(size: int, num_regions: int) -> tuple:
+    def reward(mdp: jaxhom.MDP, *draw: int) -> np.ndarray:
+        of_cells = region_weights(*draw, num_regions)[region_of(size, num_regions)]
+        return np.repeat(of_cells[:, None], mdp.num_actions, axis=1)
+
+    return f"{size}x{size} grid", functools.partial(grid, size), reward
+
+
+def _random_reward(mdp: jaxhom.MDP, *draw: int) -> np.ndarray:
+    return uniform(*draw, (mdp.num_states, mdp.num_actions))
+
+
+def _track_reward(mdp: jaxhom.MDP, *draw: int) -> np.ndarray:
+    return np.asarray(mdp.features @ track_weights(*draw, mdp.num_features))
+
+
+PLANNING = {  # title, () -> model, (model, seed, lane) -> reward [S, A]
+    **{f"grid{size}": _grid(size, 64) for size in (16, 32, 48)},
+    **{f"grid{size}": _grid(size, 100) for size in (100, 316)},
+    "racetrack_a": ("racetrack a", functools.partial(track, "a"), _track_reward),
+    "garnet_dense": ("dense Garnet", dense_garnet, _random_reward),
+    "garnet_sparse": ("Garnet, 5 successors", sparse_garnet, _random_reward),
 }

@@ -24,7 +24,7 @@ import numpy as np
 from jaxhom.solvers.programs import host_jit
 
 _STOP_FRACTION = 0.25  # of the lanes: fewer and the host is asked more often, more and lanes wait
-_MAX_WORKERS = 8
+_MAX_WORKERS = 8  # threads: more wait for Python
 
 
 class Solver(NamedTuple):

@@ -32,8 +32,8 @@ _SUFFICIENT_DECAY = 0.2  # restart at once
 _NECESSARY_DECAY = 0.8  # restart when the residual has begun to rise
 _ARTIFICIAL_FRACTION = 0.36  # restart when the round is this fraction of all steps
 _MAX_WEIGHT_CHANGE = 8.0  # per restart
-_MAX_WEIGHT = 1e4
-STEPS_PER_CHECK = 16
+_MAX_WEIGHT = 1e4  # beyond, rounding decides the smaller of the two steps
+STEPS_PER_CHECK = 16  # a look at the bounds costs about one iteration
 
 
 class Problem(Protocol):

@@ -67,7 +67,10 @@ class Record:
         kinds: dict[str, list[str]] = {"data": [], "static": [], "dropped": []}
         for field in dataclasses.fields(cls):
             kinds[next((kind for kind in kinds if field.metadata.get(kind)), "data")].append(field.name)
-        jax.tree_util.register_dataclass(cls, kinds["data"], kinds["static"], drop_fields=kinds["dropped"])
+        if kinds["dropped"]:
+            _register_without(cls, kinds["data"], kinds["static"])
+        else:
+            jax.tree_util.register_dataclass(cls, kinds["data"], kinds["static"])
 
     def replace(self, **changes: Any) -> Self:
         """Returns the record with the given fields exchanged."""
@@ -94,6 +97,19 @@ class Record:
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.keys()}
+
+
+def _register_without(cls: type, data: list[str], static: list[str]) -> None:
+    """Makes a class a pytree that forgets its other fields (`drop_fields` of jax 0.6.0 takes no field's name)."""
+
+    def flatten(record):
+        children = tuple((jax.tree_util.GetAttrKey(name), getattr(record, name)) for name in data)
+        return children, tuple(getattr(record, name) for name in static)
+
+    def unflatten(values, children):
+        return cls(**dict(zip(data, children, strict=True)), **dict(zip(static, values, strict=True)))
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
 
 
 def summary(name: str, figures: Mapping[str, Any]) -> str:

@@ -81,6 +81,8 @@ def soft_local_homomorphism(
     """
     if similarity is not None:
         warnings.warn("similarity is now called table", DeprecationWarning, stacklevel=2)
+        if table is not None:
+            raise ValueError("similarity is the former name of table: give one of them")
         table = similarity
     mdp = as_model(mdp)
     table = table_for(table, mdp, distance, anchored)

@@ -26,7 +26,7 @@ class Generalized(Protocol):
     policy: np.ndarray
     visited: np.ndarray
     radius: np.ndarray
-    undecided: np.ndarray
+    undecided: np.ndarray | None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -224,5 +224,5 @@ def _steps(count: int) -> str:
 
 def _undecided(general, state: int) -> str:
     """How many demonstrated states had no say because their similarity could not be decided."""
-    count = int(general.undecided[state])
+    count = 0 if general.undecided is None else int(general.undecided[state])
     return f" The similarity of {_states(count)} could not be decided, which counts as different." if count else ""

@@ -45,8 +45,8 @@ class Generalization(Record):
     visited: Bool[Array, " S"]
     radius: Int[Array, " S"]
     support: Int[Array, " S"]
-    undecided: Int[Array, " S"]
-    status: Int[Array, ""]
+    undecided: Int[Array, " S"] | None = None
+    status: Int[Array, ""] | None = None
     error_lower: Float[Array, ""] | None = None
     error_upper: Float[Array, ""] | None = None
     explainer: Callable[[Generalization, int], Explanation] | None = dataclasses.field(

@@ -234,6 +234,18 @@ def test_methods_without_votes(method, text):
 # ------------------------------------------------------------------------- what is kept, what is refused
 
 
+def test_a_generalization_by_hand_needs_no_word_of_how_it_ended():
+    general = generalized()
+    by_hand = jaxhom.Generalization(
+        policy=general.policy,
+        visited=general.visited,
+        radius=general.radius,
+        support=general.support,
+        explainer=general.explainer,
+    )
+    assert str(by_hand.explain(2)) == str(general.explain(2))
+
+
 def test_a_generalization_is_a_pytree_of_arrays_and_can_be_pickled():
     here, general = world("strip"), generalized()
     leaves, structure = jax.tree.flatten(general)

@@ -169,6 +169,8 @@ def test_one_table_of_decisions_serves_many_demonstrations():
     with pytest.warns(DeprecationWarning, match="similarity is now called table"):
         again = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3, similarity=shared)
     assert shared.num_solved == solved
+    with pytest.warns(DeprecationWarning), pytest.raises(ValueError, match="give one of them"):
+        soft_local_homomorphism(here.mdp, here.demonstrations, table=shared, similarity=shared)
     alone = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3)
     chex.assert_trees_all_equal(first, again, alone)
     stricter = soft_local_homomorphism(here.mdp, here.demonstrations, table=shared)

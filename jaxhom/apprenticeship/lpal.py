@@ -10,7 +10,7 @@ margin v is worth at least the expert's value plus v times the sum of the weight
 A call is checked, presolved (`presolve` takes out what no policy can reach) and handed to a method as a `Request`; what
 the method has found is certified: `certificate` computes the true margin of the policy that is returned and the best
 upper bound; and `sensitivity` gives the margin its derivatives. A method is a function from `Request` to `Found`, and
-a line of `_METHODS`. `columns` plays the game over policies, `flow` runs PDHG on the linear program itself,
+a line of `METHODS`. `columns` plays the game over policies, `flow` runs PDHG on the linear program itself,
 `interior_point` a sparse interior-point method on the same, and `quickest` chooses.
 """
 
@@ -40,11 +40,11 @@ from jaxhom.models.mdp import MDP
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float
 
-_METHODS: dict[str, Callable[[Request], Found]] = {
+METHODS: dict[str, Callable[[Request], Found]] = {
     "auto": solve_by_the_quickest,
     "columns": solve_by_columns,
-    "flow": solve_by_flow,
     "interior_point": solve_by_interior_point,
+    "flow": solve_by_flow,
 }
 
 _LARGEST = 2.0**-20  # share of the largest number of a type: what sums of expectations may need stays within it
@@ -176,7 +176,7 @@ class LPAL:
             max_iterations = checks.require_count("max_iterations", max_iterations)
         request = _presolved(self._model, batch, tolerance)
         request = request.replace(policy=policy, weights=weights, limit=max_iterations, progress=progress)
-        solution = jax.tree.map(checks.to_device, request.certified(_METHODS[method](request)))
+        solution = jax.tree.map(checks.to_device, request.certified(METHODS[method](request)))
         if checks.is_traced(self._mdp, given):
             given = jnp.atleast_2d(jnp.asarray(given, self._mdp.dtype))
             solution = with_derivatives(solution, self._mdp, given)
@@ -205,8 +205,8 @@ def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tol
 
 
 def _check_method(method: str) -> None:
-    if not isinstance(method, str) or method not in _METHODS:
-        raise ValueError(f"method must be one of {tuple(_METHODS)}, got {method!r}")
+    if not isinstance(method, str) or method not in METHODS:
+        raise ValueError(f"method must be one of {tuple(METHODS)}, got {method!r}")
 
 
 def _refuse_traced(*trees) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxhom import interrupts
+from jaxhom.apprenticeship.lpal import METHODS as LPAL_METHODS
 from jaxhom.apprenticeship.lpal import lpal
 from jaxhom.cli import pictures, results
 from jaxhom.cli.methods import METHODS, add_method_options, check_method, generalize, wants_progress
@@ -41,7 +42,7 @@ demonstrations in .csv files: one step a line, the first line names the columns 
 .npz files are NumPy archives (numpy.savez) of plain arrays:
 
 {}"""
-_LPAL_METHODS = ("auto", "columns", "interior_point", "flow")
+_LPAL_METHODS = tuple(LPAL_METHODS)
 
 
 def add_parser(commands: Any) -> None:

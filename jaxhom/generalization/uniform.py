@@ -52,7 +52,17 @@ def uniform_elsewhere(mdp: MDP, demonstrations: Demonstrations) -> Generalizatio
 
 
 def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
-    """The former name of `uniform_elsewhere`, which warns: it has nothing to do with maximum-entropy inverse RL."""
+    """The former name of `uniform_elsewhere`, which warns: it has nothing to do with maximum-entropy inverse RL.
+
+    Example:
+      >>> import jaxhom, warnings
+      >>> demonstrations = jaxhom.Demonstrations.from_trajectories([([0, 1], [2, 2])])
+      >>> with warnings.catch_warnings(record=True) as said:
+      ...     warnings.simplefilter("always")
+      ...     general = jaxhom.maximum_entropy(jaxhom.gridworld(4), demonstrations)
+      >>> [warning.category.__name__ for warning in said]
+      ['DeprecationWarning']
+    """
     warnings.warn(
         "maximum_entropy is now called uniform_elsewhere: it is no maximum-entropy inverse reinforcement learning",
         DeprecationWarning,

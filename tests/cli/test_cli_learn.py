@@ -156,7 +156,7 @@ def test_the_solver_and_its_tolerance_reach_lpal(files, monkeypatch, options, so
 
 
 def test_every_solver_of_lpal_can_be_chosen():
-    assert set(learn._LPAL_METHODS) == set(lpal._METHODS)
+    assert set(learn._LPAL_METHODS) == set(lpal.METHODS)
 
 
 def test_values_against_the_optimum(files, capsys):

@@ -42,7 +42,7 @@ class Lane:
       lower, mixture: the best lower bound so far, and the policies and probabilities that prove it.
       guess: [K] or None, the next query instead of a mixture.
       gaps: after each round. made: policies added by this lane. idle: rounds without progress.
-      has_moved: the bound is better than that of the first query. was_slow: it was slow once.
+      has_moved: the bound is better than that of the first query.
     """
 
     expectations: Float[np.ndarray, " K"]
@@ -62,7 +62,6 @@ class Lane:
     gaps: list[float] = dataclasses.field(default_factory=list)
     idle: int = 0
     has_moved: bool = False
-    was_slow: bool = False
 
     @property
     def gap(self) -> float:
@@ -74,9 +73,9 @@ class Lane:
         return self.gap <= (1.0 - SLACK) * self.tolerance or self.made >= limit or self.idle >= _PATIENCE
 
     def is_slow(self) -> bool:
-        """Whether columns will have to be many; said once of a lane."""
+        """Whether columns will have to be many."""
         rounds, back = (_MANY_ROUNDS, _MORE_ROUNDS) if self.has_moved else (_ROUNDS, _SOME_ROUNDS)
-        if self.was_slow or len(self.gaps) < rounds:
+        if len(self.gaps) < rounds:
             return False
         return self.gap > _LITTLE * self.gaps[-1 - back]
 

@@ -16,7 +16,6 @@ import numpy as np
 from jaxhom.apprenticeship.column_games import capacities, play
 from jaxhom.apprenticeship.column_lane import SLACK, Lane
 from jaxhom.apprenticeship.exact import NEAR_ONE, Exact
-from jaxhom.apprenticeship.interior_point import Point
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.responses import evaluate, evaluate_on_host, respond, respond_on_host, with_compact_features
@@ -58,33 +57,37 @@ class Rounds:
         self._error = 0.25 * SLACK * float(request.tolerance.min())
         self._exact = request.model.once(_exact_where_rough)
 
-    def lane(self, number: int) -> Lane:
-        """The lane of one problem; with a first column if there is a policy to begin with."""
+    def lanes(self) -> list[Lane]:
+        """One for each problem; with a first column where there is a policy to begin with."""
+        lanes = [self._lane(number) for number in range(len(self._request.lanes))]
+        if self._request.policy is not None:
+            self.add_policies(lanes, self._request.policy)
+        return lanes
+
+    def _lane(self, number: int) -> Lane:
         asked = self._request
         expectations, spent = asked.expectations[number], 0 if asked.spent is None else int(asked.spent[number])
         uniform = np.full(len(expectations), 1.0 / len(expectations))
         weights = uniform if asked.weights is None else asked.weights[number]
-        value = np.zeros(self._mdp.num_states)
-        lane = Lane(expectations, float(asked.tolerance[number]), value, weights, made=spent)
-        if asked.policy is not None:
-            self._add_policy(lane, asked.policy[number])
-        return lane
+        value = np.zeros(self._mdp.num_states) if asked.value is None else asked.value[number]
+        return Lane(expectations, float(asked.tolerance[number]), value, weights, made=spent)
 
-    def resume(self, lane: Lane, point: Point) -> None:
-        """Takes in what another method has found: its policy as a column, its weights as the next query."""
-        best = uniform_policy(self._mdp) if lane.actions is None else self._pool.one_hot(lane.actions)
-        self._add_policy(lane, policy_from_occupancy(self._mdp, point.x, np.asarray(best)))
-        lane.guess, lane.value, lane.made = point.weights, point.value, lane.made + point.steps
+    def add_policies(self, lanes: list[Lane], x: Float[np.ndarray, "C S A"]) -> None:
+        """A column for each lane: the policy, which may be stochastic, of an occupancy up to scale (eq. 5)."""
+        for chunk, (policies, *evaluated) in self._in_chunks(self._evaluate, list(zip(lanes, x, strict=True))):
+            for (lane, _), policy, mu, expected in zip(chunk, policies, *evaluated, strict=False):
+                if np.isfinite(expected).all():
+                    lane.add([self._pool.add(mu, policy, expected)], self._room)
 
-    def _add_policy(self, lane: Lane, policy: Float[np.ndarray, "S A"]) -> None:
-        """A column of a policy that may be stochastic."""
-        if self._exact is None:
-            evaluated = evaluate(self._mdp, policy)
-        else:
-            evaluated = evaluate_on_host(self._exact, policy, self._error)
-        mu, expected = map(np.asarray, evaluated)
-        if np.isfinite(expected).all():
-            lane.add([self._pool.add(mu, np.asarray(policy), expected)], self._room)
+    def _evaluate(self, chunk: list[tuple[Lane, Float[np.ndarray, "S A"]]]) -> tuple[np.ndarray, ...]:
+        """Policies [L, S, A], their state occupancies [L, S] and feature expectations [L, K]."""
+        x = np.stack([x for _, x in chunk])
+        policies = policy_from_occupancy(self._mdp, x, np.broadcast_to(np.asarray(uniform_policy(self._mdp)), x.shape))
+        if self._exact is not None:
+            parts = [evaluate_on_host(self._exact, policy, self._error) for policy in policies]
+            return policies, *map(np.stack, zip(*parts, strict=True))
+        policies = policies[np.minimum(np.arange(self._width), len(policies) - 1)]
+        return policies, *map(np.asarray, evaluate(self._mdp, policies, self._error))
 
     # ---------------------------------------------------------------------------------------------- best responses
 

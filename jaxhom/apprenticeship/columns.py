@@ -11,20 +11,21 @@ half of the open one, and the response is asked for between these weights and th
 separation, Ben-Ameur and Neto 2007).
 
 The lanes of a batch share the model, and so the policies: what one has met is in the pool, and any other may use it.
-`column_lane` is the state of one lane, `column_rounds` one round of some of them, `column_helper` another method for
-lanes that do not get on. Here is the loop: a few lanes are under way at a time, so that later ones find many policies
-made, and their rounds are in step, so that the answer does not depend on which thread is first.
+`column_lane` is the state of one lane, `column_rounds` one round of some of them. Here is the loop: a few lanes are
+under way at a time, so that later ones find many policies made, and their rounds are in step, so that the answer does
+not depend on which thread is first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import jax
+import numpy as np
 from tqdm import tqdm
 
-from jaxhom.apprenticeship.column_helper import Help, Helper
 from jaxhom.apprenticeship.column_lane import Lane
 from jaxhom.apprenticeship.column_rounds import Rounds
 from jaxhom.apprenticeship.request import Request
@@ -33,6 +34,9 @@ from jaxhom.models.mdp import MDP
 from jaxhom.planning.chain_solver import is_solved_by_lu
 from jaxhom.solvers.lane_queue import num_cores
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int
+
 DEFAULT_COLUMNS = 500
 _LANES_AT_A_TIME = 4  # programs of them under way per core, so that later ones find policies in the pool: 16 lanes of
 # bumps24 (bench/results/speed_lpal.csv) take 342 iterations, 354 all at once
@@ -40,28 +44,75 @@ _NUMBERS_AT_A_TIME = 1024  # states times lanes of one program: small models are
 _MAX_WIDTH = 32  # a wider program waits longer for its slowest lane
 
 
-def solve_by_columns(request: Request, find_help: Callable[[], Help | None] | None = None) -> Found:
-    """The batch by columns; where `find_help` finds another method, that takes its share of the slow lanes."""
-    limit, total = request.limit or DEFAULT_COLUMNS, len(request.lanes)
-    workers, width = _workers_and_width(request.model.mdp, total)
-    bar = tqdm(disable=not request.progress, desc="LPAL", unit="column")
-    with ThreadPoolExecutor(workers) as threads, Helper(find_help, limit, waits=workers == 1) as helper, bar:
-        rounds = Rounds(request, limit, width, workers, threads.map)
-        lanes = [rounds.lane(number) for number in range(total)]
-        waiting, busy = list(reversed(lanes)), []
-        while waiting or busy or helper.lanes:
-            if not (waiting or busy):
-                for lane, point in helper.give_back():
-                    rounds.resume(lane, point)
-                    busy.append(lane)
-                    bar.update()
-            while waiting and len(busy) < _LANES_AT_A_TIME * workers * width:
-                busy.append(waiting.pop())
-            rounds.respond_to(busy)
-            rounds.play_games(busy)
-            _show(bar, busy, len(busy) + len(waiting) + len(helper.lanes))
-            busy = helper.take_from([lane for lane in busy if not lane.is_done(limit)])
-        return rounds.found(lanes)
+def solve_by_columns(request: Request, *, gives_up: bool = False) -> Found:
+    """The batch by columns.
+
+    Args:
+      request: the lanes.
+      gives_up: whether lanes that do not get on end: another method will take them.
+    """
+    with Columns(request) as columns:
+        columns.play(range(len(request.lanes)), gives_up=gives_up)
+        return columns.found()
+
+
+class Columns:
+    """The lanes of a request and their games, in the middle of it: other methods may say where to go on.
+
+    To be used in a `with` statement, which ends its threads.
+    """
+
+    def __init__(self, request: Request):
+        self._limit, self._progress, total = request.limit or DEFAULT_COLUMNS, request.progress, len(request.lanes)
+        workers, width = _workers_and_width(request.model.mdp, total)
+        self._threads, self._most = ThreadPoolExecutor(workers), _LANES_AT_A_TIME * workers * width
+        self._rounds = Rounds(request, self._limit, width, workers, self._threads.map)
+        self._lanes = self._rounds.lanes()
+
+    def __enter__(self) -> Columns:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._threads.shutdown(cancel_futures=True)
+
+    def play(self, numbers: Iterable[int], *, rounds: int | None = None, gives_up: bool = False) -> None:
+        """Rounds of some lanes, until each is closed, or has had so many, or (`gives_up`) does not get on."""
+        lanes = [self._lanes[number] for number in numbers]
+        last = {id(lane): np.inf if rounds is None else len(lane.gaps) + rounds for lane in lanes}
+
+        def is_over(lane: Lane) -> bool:
+            return lane.is_done(self._limit) or len(lane.gaps) >= last[id(lane)] or (gives_up and lane.is_slow())
+
+        waiting, busy = lanes[::-1], []
+        with tqdm(disable=not self._progress, desc="LPAL", unit="column") as bar:
+            while waiting or busy:
+                while waiting and len(busy) < self._most:
+                    busy.append(waiting.pop())
+                self._rounds.respond_to(busy)
+                self._rounds.play_games(busy)
+                _show(bar, busy, len(busy) + len(waiting))
+                busy = [lane for lane in busy if not is_over(lane)]
+
+    def offer(self, numbers: Iterable[int], found: Found, is_policy: Bool[np.ndarray, " C"]) -> None:
+        """What another method has found for some lanes: what to ask next, and columns where a policy is good enough."""
+        lanes = [self._lanes[number] for number in numbers]
+        for lane, weights, value in zip(lanes, found.weights, found.value, strict=True):
+            lane.guess, lane.value = weights, value
+        some = np.flatnonzero(is_policy)
+        self._rounds.add_policies([lanes[k] for k in some], found.x[some])
+
+    def spend(self, numbers: Iterable[int], iterations: int) -> None:
+        """Counts another method's iterations."""
+        for number in numbers:
+            self._lanes[number].made += iterations
+
+    def open(self) -> Int[np.ndarray, " C"]:
+        """The lanes that are not closed and have iterations left."""
+        return np.array([k for k, lane in enumerate(self._lanes) if not lane.is_done(self._limit)], int)
+
+    def found(self) -> Found:
+        """What all lanes end with."""
+        return self._rounds.found(self._lanes)
 
 
 def _workers_and_width(mdp: MDP, total: int) -> tuple[int, int]:

@@ -1,7 +1,8 @@
-"""The factorisation behind the flow method, made once on the host: (M M^T)^-1 for `FlowProjection`."""
+"""What PDHG on the flow shares between lanes, made once on the host: a model in block order, and its factor."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -9,53 +10,79 @@ import numpy as np
 import scipy.sparse
 
 from jaxhom import checks
-from jaxhom.apprenticeship.flow_lp import FEATURE_SCALE, FlowProjection
+from jaxhom.apprenticeship.exact import compact_features
+from jaxhom.apprenticeship.flow_splitting import FlowFactor, Splitting
+from jaxhom.models.construction import make_dynamics
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.flow_matrix import flow_matrix
-from jaxhom.solvers.block_tridiagonal import BlockCholesky, order_in_blocks
+from jaxhom.solvers.block_tridiagonal import BlockCholesky, Blocks, order_in_blocks
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jax.typing import DTypeLike
+    from jaxtyping import Float, Int
 
 _REGULARISATIONS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)  # shares of the diagonal, to be tried in turn
-_MAX_ENTRIES = 2**28  # of the factor: 2 GB in float64
+MAX_ENTRIES = 2**28  # of the factor: 2 GB in float64
 
 
-def factor_flow(mdp: MDP, features: Float[np.ndarray, "S A K"]) -> FlowProjection:
-    """Factorises the rows of the affine set.
+def factor_entries(mdp: MDP) -> tuple[Blocks, int]:
+    """The order of the states for a model's factor, and how many numbers that takes."""
+    flow = abs(flow_matrix(mdp))
+    pattern = flow.toarray() @ flow.toarray().T if mdp.is_dense else flow @ flow.T
+    blocks = order_in_blocks(scipy.sparse.csr_array(pattern))
+    return blocks, 3 * blocks.count * blocks.size**2
+
+
+def split_flow(mdp: MDP, unit: Float[np.ndarray, " K"], dtype: DTypeLike) -> tuple[Splitting, Int[np.ndarray, " S"]]:
+    """The program of a model without its expectations, and the order in which it has the states.
 
     Args:
       mdp: the model.
-      features: [S, A, K], as scaled in the program.
+      unit: [K], that of each feature.
+      dtype: of the iterations.
 
     Raises:
       ValueError: if the factor would take more than 2 GB.
     """
-    flow, phi = flow_matrix(mdp), np.asarray(features, float).reshape(-1, features.shape[-1])  # 0 where not allowed
+    blocks, entries = factor_entries(mdp)
+    if entries > MAX_ENTRIES:
+        raise ValueError(
+            f"method='pdhg' needs a factor of {entries:.1e} entries for this model of {mdp.num_states} states, "
+            f"more than {MAX_ENTRIES:.1e}: use method='columns'"
+        )
+    features = np.asarray(mdp.features, np.float64) / unit
+    share = None if (unit == unit[0]).all() else checks.to_device(unit.min() / unit, dtype)
+    ordered = compact_features(features, np.asarray(mdp.allowed))[blocks.order]
+    splitting = Splitting(
+        mdp=_reordered(mdp, blocks, dtype),
+        features=checks.to_device(ordered, dtype),
+        factor=_factor(mdp, features, blocks, dtype),
+        share=share,
+    )
+    return splitting, blocks.order
+
+
+def _factor(mdp: MDP, features: Float[np.ndarray, "S A K"], blocks: Blocks, dtype: DTypeLike) -> FlowFactor:
+    flow, phi = flow_matrix(mdp), features.reshape(-1, features.shape[-1])  # 0 where not allowed
     if mdp.is_dense:  # a sparse product of full matrices takes seconds
         flow = flow.toarray()
-    normal, cross = scipy.sparse.csr_array(flow @ flow.T), flow @ phi
-    blocks = order_in_blocks(normal)
-    entries = 2 * blocks.count * blocks.size**2
-    if entries > _MAX_ENTRIES:
-        raise ValueError(
-            f"method='flow' needs a factor of {entries:.1e} entries for this model of {mdp.num_states} states, "
-            f"more than {_MAX_ENTRIES:.1e}: use method='columns'"
-        )
-    factor = _factor(normal, blocks)
+    factor, cross = _cholesky(scipy.sparse.csr_array(flow @ flow.T), blocks), flow @ phi
     behind = factor.solve(cross)
-    schur = phi.T @ phi + FEATURE_SCALE**2 * np.eye(phi.shape[1]) - cross.T @ behind
-    padding = np.full(blocks.count * blocks.size - len(blocks.order), mdp.num_states)
+    schur = phi.T @ phi + np.eye(phi.shape[1]) - cross.T @ behind
     lower, diagonal = factor.unit_factor()
-    arrays = {"lower": lower, "diagonal": diagonal, "behind": behind, "schur": np.linalg.inv(schur)}
-    return FlowProjection(
-        order=checks.to_device(np.concatenate([blocks.order, padding]), jnp.int32),
-        place=checks.to_device(blocks.place, jnp.int32),
-        **{name: checks.to_device(array, mdp.dtype) for name, array in arrays.items()},
-    )
+    ordered = behind[blocks.order]
+    arrays = {
+        "lower": lower,
+        "upper": np.roll(lower, -1, axis=0).transpose(0, 2, 1),
+        "diagonal": diagonal,
+        "behind": ordered,
+        "behind_transpose": ordered.T,
+        "schur": np.linalg.inv(schur),
+    }
+    return FlowFactor(**{name: checks.to_device(np.ascontiguousarray(array), dtype) for name, array in arrays.items()})
 
 
-def _factor(normal, blocks) -> BlockCholesky:
+def _cholesky(normal: scipy.sparse.sparray, blocks: Blocks) -> BlockCholesky:
     """With as little regularisation as rounding asks for: certificates do not need exact projections."""
     for share in _REGULARISATIONS:
         try:
@@ -63,3 +90,23 @@ def _factor(normal, blocks) -> BlockCholesky:
         except np.linalg.LinAlgError:
             continue
     return BlockCholesky(normal, blocks, 1.0)
+
+
+def _reordered(mdp: MDP, blocks: Blocks, dtype: DTypeLike) -> MDP:
+    """The model without features, in the given order of the states."""
+    order, nothing = blocks.order, np.zeros((mdp.num_states, mdp.num_actions, 0))
+    probability = np.asarray(mdp.probability)[order]
+    if mdp.is_dense:
+        next_state, probability = np.asarray(mdp.next_state), probability[..., order]
+    else:
+        next_state = np.where(probability > 0, blocks.place[np.asarray(mdp.next_state)[order]], 0)
+        ascending = np.argsort(np.where(probability > 0, next_state, len(order)), axis=-1, kind="stable")
+        next_state, probability = (np.take_along_axis(a, ascending, axis=-1) for a in (next_state, probability))
+    return dataclasses.replace(
+        mdp,
+        dynamics=make_dynamics(next_state, probability, dtype),
+        initial=checks.to_device(np.asarray(mdp.initial)[order], dtype),
+        features=checks.to_device(nothing, dtype),
+        discount=checks.to_device(np.asarray(mdp.discount), dtype),
+        allowed=checks.to_device(np.asarray(mdp.allowed)[order], jnp.bool_),
+    )

@@ -18,6 +18,7 @@ import scipy.sparse
 from tqdm import tqdm
 
 from jaxhom.apprenticeship.certificate import simplex_point
+from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found
 from jaxhom.models.mdp import MDP
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 DEFAULT_STEPS = 100
+_MOST_WORK = 3e9  # multiplications of a step: grid100 (bench.instances) takes 4.1 s either way
 _MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals: certificates are made of what is left
 
 
@@ -84,6 +86,11 @@ class Program:
         x.ravel()[self._pairs] = point.z[: len(self._pairs)]
         weights = simplex_point(point.y[num_states:] / self._unit)
         return Point(x, weights, -point.y[:num_states], point.steps, point.status)
+
+
+def is_banded(model: PreparedModel) -> bool:
+    """Whether a step costs so little that a few dozen of them are quicker than columns."""
+    return not model.mdp.is_dense and model.once(Program).work <= _MOST_WORK
 
 
 def solve_by_interior_point(request: Request) -> Found:

@@ -26,8 +26,8 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.columns import solve_by_columns
-from jaxhom.apprenticeship.flow import solve_by_flow
 from jaxhom.apprenticeship.interior_point import solve_by_interior_point
+from jaxhom.apprenticeship.pdhg import solve_by_pdhg
 from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectations
 from jaxhom.apprenticeship.quickest import solve_by_the_quickest
@@ -44,7 +44,7 @@ METHODS: dict[str, Callable[[Request], Found]] = {
     "auto": solve_by_the_quickest,
     "columns": solve_by_columns,
     "interior_point": solve_by_interior_point,
-    "flow": solve_by_flow,
+    "pdhg": solve_by_pdhg,
 }
 
 _LARGEST = 2.0**-20  # share of the largest number of a type: what sums of expectations may need stays within it

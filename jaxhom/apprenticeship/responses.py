@@ -61,10 +61,12 @@ def respond(
 
 
 @jax.jit
-def evaluate(mdp: MDP, policy: Float[Array, "S A"]) -> tuple[Float[Array, " S"], Float[Array, " K"]]:
-    """State occupancy [S] and feature expectations [K] of a policy [S, A]."""
-    mu, expected = _expected_features(mdp, policy[None], 0.0)
-    return mu[:, 0], expected[0]
+def evaluate(
+    mdp: MDP, policy: Float[Array, "L S A"], error: Float[Array, ""]
+) -> tuple[Float[Array, "L S"], Float[Array, "L K"]]:
+    """State occupancies and feature expectations of policies, these up to an error."""
+    mu, expected = _expected_features(mdp, policy, error)
+    return mu.T, expected
 
 
 def _expected_features(mdp, policy, error):

@@ -59,7 +59,11 @@ class Found:
 
     def lane(self, number: int) -> Found:
         """One lane, without its axis."""
-        return Found(**{name: None if leaf is None else leaf[number] for name, leaf in self._by_lane().items()})
+        return self.part(number)
+
+    def part(self, numbers: Int[np.ndarray, " C"] | int) -> Found:
+        """Some of the lanes; one without its axis."""
+        return Found(**{name: None if leaf is None else leaf[numbers] for name, leaf in self._by_lane().items()})
 
     def with_lanes(self, numbers: Int[np.ndarray, " C"], other: Found) -> Found:
         """What was found, with the given lanes as in `other`."""

@@ -148,6 +148,7 @@ class State(Record):
     Attributes:
       t: [S, A, lanes]. v: [K, lanes]. weight: [lanes], tau.
       change: [lanes], sum |x' - x| of the last iteration: x sums to about 1, and is off the flow by no more.
+      moved: [lanes], sum |w - former w| since the weight was looked at: 0 where w has arrived at a vertex.
       iterations: int32 [lanes].
     """
 
@@ -155,6 +156,7 @@ class State(Record):
     v: Float[Array, "K lanes"]
     weight: Float[Array, " lanes"]
     change: Float[Array, " lanes"]
+    moved: Float[Array, " lanes"]
     iterations: Int[Array, " lanes"]
 
 
@@ -181,7 +183,7 @@ def begin(splitting: Splitting, goal: Goal) -> State:
     one = jnp.ones(goal.w.shape[-1], goal.w.dtype)
     x = splitting.allowed(goal.x)
     v = splitting.expected(x) - goal.w
-    return State(t=x, v=v, weight=one, change=one, iterations=one.astype(jnp.int32) * 0)
+    return State(t=x, v=v, weight=one, change=one, moved=one, iterations=one.astype(jnp.int32) * 0)
 
 
 def point(splitting: Splitting, goal: Goal, state: State) -> Point:
@@ -211,6 +213,7 @@ def advance(splitting: Splitting, goal: Goal, state: State) -> State:
         t=new.x - weight * new.multiplier,
         v=new.u - weight * new.w,
         weight=weight,
+        moved=jnp.abs(new.w - old.w).sum(axis=0),
         iterations=state.iterations + STEPS_PER_WEIGHT,
     )
 

@@ -10,6 +10,7 @@ band, or columns to the end.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
@@ -19,12 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom.apprenticeship.certificate import simplex_point
-from jaxhom.apprenticeship.columns import Columns
+from jaxhom.apprenticeship.columns import Columns, solve_by_columns
 from jaxhom.apprenticeship.flow_factor import split_flow
 from jaxhom.apprenticeship.flow_splitting import STEPS_PER_WEIGHT, Goal, Splitting, State, advance, begin, reading
 from jaxhom.apprenticeship.interior_point import is_banded, solve_by_interior_point
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found
+from jaxhom.apprenticeship.stages import in_turn
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.occupancy import occupancy
 from jaxhom.solvers.lane_queue import num_cores
@@ -35,9 +37,10 @@ if TYPE_CHECKING:
 
 DEFAULT_ITERATIONS = 1000
 _LOOKS = (100, 50, 50, 50)
+_ARRIVED = 1e-4  # of w
 _NEAR = 1e-3  # x is off the flow by so much at most where its policy is worth a column
 _MOST_LANES = 16  # of a program: more leave the caches of a core
-_ROUNDS = 8  # of columns, for lanes that get on
+_ROUNDS = 3  # of columns, for lanes that get on
 _STREAMED = (
     2**21
 )  # entries of a third of a factor from which reading it takes longer than its products: one program for all lanes
@@ -48,7 +51,7 @@ class FlowProgram:
 
     def __init__(self, mdp: MDP, dtype: np.dtype | None = None):
         features = np.asarray(mdp.features, np.float64)
-        self.dtype = np.dtype(mdp.dtype if dtype is None else dtype)
+        self.dtype = np.dtype(np.float32)
         self._unit = _units(np.abs(features).max(axis=(0, 1)))
         self.splitting, self._order = split_flow(mdp, self._unit, self.dtype)
         self._place, self._mdp = np.argsort(self._order), mdp
@@ -131,28 +134,34 @@ def _units(size: np.ndarray) -> np.ndarray:
 
 def solve_by_pdhg(request: Request) -> Found:
     """PDHG, and for lanes that it leaves open the interior point, or columns to the end."""
-    with Columns(request.replace(limit=request.limit or DEFAULT_ITERATIONS, policy=None)) as columns:
-        _iterate(request, columns)
-        left = columns.open()
-        if left.size and is_banded(request.model):
-            columns.offer(left, solve_by_interior_point(request.part(left)), np.ones(left.size, bool))
-        columns.play(columns.open())
-        return columns.found()
+    banded = is_banded(request.model)
+    return in_turn(
+        request,
+        functools.partial(_iterate, to_the_end=not banded),
+        *[solve_by_interior_point] * banded,
+        solve_by_columns,
+    )
 
 
-def _iterate(request: Request, columns: Columns) -> None:
-    """PDHG, and columns' looks at where it is."""
-    program = request.model.once(FlowProgram)
+def _iterate(request: Request, *, to_the_end: bool) -> Found:
+    """PDHG, and columns where a lane has its weights, or its policy."""
+    program, total = request.model.once(FlowProgram), len(request.lanes)
     goal = jax.tree.map(np.asarray, program.goal(request.expectations, request.policy, request.weights))
-    left, state = np.arange(len(request.lanes)), None
-    for count in _LOOKS:
-        state = program.advance(goal, state, count)
-        columns.spend(left, count)
-        found = program.read(goal, state)
-        columns.offer(left, found, state.change <= _NEAR)
-        columns.play(left, rounds=1)
-        still = np.isin(left, columns.open())
-        left = left[still]
-        if not left.size:
-            return
-        goal, state = jax.tree.map(lambda leaf, still=still: leaf[..., still], (goal, state))
+    left, state = np.arange(total), None
+    with Columns(request.replace(limit=request.limit or DEFAULT_ITERATIONS, policy=None)) as columns:
+        for count in _LOOKS:
+            state = program.advance(goal, state, count)
+            columns.spend(left, count)
+            has_policy = state.change <= _NEAR
+            some = np.flatnonzero(has_policy | (state.moved <= _ARRIVED))
+            columns.offer(left[some], program.read(goal, state).part(some), has_policy[some])
+            columns.play(left[some], rounds=_ROUNDS, gives_up=True)
+            still = np.isin(left, columns.open())
+            left = left[still]
+            if not left.size:
+                break
+            goal, state = jax.tree.map(lambda leaf, still=still: leaf[..., still], (goal, state))
+        if left.size and to_the_end:
+            columns.offer(left, program.read(goal, state), state.change <= _NEAR)
+            columns.play(left)
+        return columns.found()

@@ -132,6 +132,7 @@ class Certifier:
             margin_bound=high,
             weights=weights,
             iterations=np.int32(found.iterations),
+            decided_by=np.int32(found.decided_by),
             status=np.int32(Status.SOLVED if is_closed else found.stopped),
         )
 

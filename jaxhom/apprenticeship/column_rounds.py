@@ -66,11 +66,11 @@ class Rounds:
 
     def _lane(self, number: int) -> Lane:
         asked = self._request
-        expectations, spent = asked.expectations[number], 0 if asked.spent is None else int(asked.spent[number])
+        expectations = asked.expectations[number]
         uniform = np.full(len(expectations), 1.0 / len(expectations))
         weights = uniform if asked.weights is None else asked.weights[number]
-        value = np.zeros(self._mdp.num_states) if asked.value is None else asked.value[number]
-        return Lane(expectations, float(asked.tolerance[number]), value, weights, made=spent)
+        value = np.zeros(self._mdp.num_states) if asked.value is None else np.nan_to_num(asked.value[number])
+        return Lane(expectations, float(asked.tolerance[number]), value, weights)
 
     def add_policies(self, lanes: list[Lane], x: Float[np.ndarray, "C S A"]) -> None:
         """A column for each lane: the policy, which may be stochastic, of an occupancy up to scale (eq. 5)."""

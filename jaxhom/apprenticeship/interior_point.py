@@ -102,7 +102,6 @@ def solve_by_interior_point(request: Request) -> Found:
     x, weights, value = (np.stack([getattr(point, name) for point in points]) for name in ("x", "weights", "value"))
     stopped = [Status.ITERATION_LIMIT if point.status == Status.ITERATION_LIMIT else Status.STALLED for point in points]
     steps = np.array([point.steps for point in points])
-    steps += 0 if request.spent is None else request.spent
     return Found(
         x=x,
         weights=weights,

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,9 @@ from jaxhom.status import Status
 
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
+
+T = TypeVar("T")
 
 # 14 and 18 of 32 lanes of grid16 and grid48 (bench.instances) close within 250 iterations. Of the others hardly one
 # closes in 150 more: their best policies mix as many deterministic ones as there are features.
@@ -64,31 +66,41 @@ def iterate(request: Request, *, to_the_end: bool = False) -> Found:
       request: the lanes.
       to_the_end: whether columns go on with the lanes that are left.
     """
-    program, total = request.model.once(FlowProgram), len(request.lanes)
+    program, left, state = request.model.once(FlowProgram), np.arange(len(request.lanes)), None
     goal = jax.tree.map(np.asarray, program.goal(request.expectations, request.policy, request.weights))
-    left, state, limit = np.arange(total), None, request.limit or sum(_LOOKS) + DEFAULT_COLUMNS
-    with Columns(request.replace(limit=limit, policy=None)) as columns:
+    width = min(_MOST_LANES, 1 << (-(-left.size // program.workers) - 1).bit_length())
+    limit = request.limit or sum(_LOOKS) + DEFAULT_COLUMNS
+    with Columns(request.replace(limit=limit)) as columns:
+        if request.policy is not None or request.weights is not None:  # which may be the best already
+            columns.play(left, rounds=1)
+            left, goal = _still_open(columns, left, goal)
         for count in _looks(limit):
-            state = program.advance(goal, state, count)
+            if not left.size:
+                break
+            state = program.advance(goal, state, count, width)
             columns.spend(left, count)
             has_policy = state.change <= _NEAR
             some = np.flatnonzero(has_policy | (state.moved <= _ARRIVED))
-            columns.offer(left[some], program.read(goal, state).part(some), has_policy[some])
+            columns.offer(left[some], program.read(goal, state, width).part(some), has_policy[some])
             columns.play(left[some], rounds=_ROUNDS, gives_up=True)
-            is_open = np.isin(left, columns.open())
-            left = left[is_open]
-            if not left.size:
-                return columns.found(LPALMethod.PDHG)
-            goal, state = jax.tree.map(lambda leaf, kept=is_open: leaf[..., kept], (goal, state))
-        if to_the_end or sum(state.iterations[:1]) < sum(_LOOKS):  # stopped by the limit: nobody else will have them
-            columns.offer(left, program.read(goal, state), state.change <= _NEAR)
-            columns.play(left, rounds=None if to_the_end else 1)
+            left, (goal, state) = _still_open(columns, left, (goal, state))
+        if left.size and (to_the_end or limit <= sum(_LOOKS)):  # nobody else will have them
+            if state is not None:
+                columns.offer(left, program.read(goal, state, width), state.change <= _NEAR)
+            columns.play(left)
         return columns.found(LPALMethod.PDHG)
 
 
+def _still_open(columns: Columns, lanes: Int[np.ndarray, " C"], arrays: T) -> tuple[Int[np.ndarray, " C"], T]:
+    """Those of the lanes that are open, with their arrays, lanes last."""
+    is_open = np.isin(lanes, columns.open())
+    return lanes[is_open], jax.tree.map(lambda leaf: leaf[..., is_open], arrays)
+
+
 def _looks(limit: int) -> list[int]:
-    """Iterations before each look, so many in all that a response is left; ten at the least."""
-    ends = np.minimum(np.cumsum(_LOOKS), max((limit - 1) // STEPS_PER_WEIGHT, 1) * STEPS_PER_WEIGHT)
+    """Iterations before each look, in tens, so few in all that looks have their columns; perhaps none."""
+    most = limit - 1 - _ROUNDS * (len(_LOOKS) - 1)
+    ends = np.minimum(np.cumsum(_LOOKS), max(most // STEPS_PER_WEIGHT, 0) * STEPS_PER_WEIGHT)
     return [int(count) for count in np.diff(ends, prepend=0) if count]
 
 
@@ -102,8 +114,7 @@ class FlowProgram:
         self.splitting, order = split_flow(mdp, self._unit, self.dtype)
         self._mdp, self._order, self._place = mdp, order, np.argsort(order)
         self._kept = 1.0 - float(mdp.discount)
-        self._workers = 1 if self.splitting.factor.diagonal.size > _STREAMED else num_cores()
-        self._width = 0  # lanes of a program, once there are lanes
+        self.workers = 1 if self.splitting.factor.diagonal.size > _STREAMED else num_cores()
 
     def goal(
         self,
@@ -125,40 +136,41 @@ class FlowProgram:
         }
         return Goal(**{name: np.ascontiguousarray(part, self.dtype) for name, part in parts.items()})
 
-    def advance(self, goal: Goal, state: State | None, count: int) -> State:
+    def advance(self, goal: Goal, state: State | None, count: int, width: int) -> State:
         """So many iterations of all lanes, in tens; begun where there is no state. NumPy arrays."""
-        parts = self._in_parts(lambda *some: _advance(self.splitting, *some, count // STEPS_PER_WEIGHT), goal, state)
+        parts = self._in_parts(
+            lambda *some: _advance(self.splitting, *some, count // STEPS_PER_WEIGHT), goal, state, width
+        )
         return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *parts)
 
-    def read(self, goal: Goal, state: State) -> Found:
+    def read(self, goal: Goal, state: State, width: int) -> Found:
         """What the lanes say, in the units of the model."""
-        parts = self._in_parts(lambda *some: _reading(self.splitting, *some), goal, state)
+        parts = self._in_parts(lambda *some: _reading(self.splitting, *some), goal, state, width)
         x, w, value = (np.concatenate(part, axis=-1, dtype=np.float64) for part in zip(*parts, strict=True))
         total = len(state.iterations)
         return Found(
             x=np.moveaxis(x, -1, 0)[:, self._place] / self._kept,
             weights=simplex_point(w.T),
-            value=value.T[:, self._place] * (self._unit.min() / self._kept),
+            value=value.T[:, self._place] * self._unit.min(),
             iterations=state.iterations,
             stopped=np.full(total, Status.ITERATION_LIMIT),
             decided_by=np.full(total, LPALMethod.PDHG),
             gap=np.full(total, np.inf),
         )
 
-    def _in_parts(self, run: Callable, goal: Goal, state: State | None) -> list:
-        """What `run` makes of some lanes at a time, on all cores; NumPy, without lanes that fill up the last part."""
+    def _in_parts(self, run: Callable, goal: Goal, state: State | None, width: int) -> list:
+        """What `run` makes of `width` lanes at a time, on all cores; NumPy, without lanes that fill up the last."""
         total = goal.w.shape[-1]
-        self._width = self._width or min(_MOST_LANES, -(-total // self._workers))
 
         def part(first: int):
-            lanes = np.minimum(np.arange(first, first + self._width), total - 1)
+            lanes = np.minimum(np.arange(first, first + width), total - 1)
             some = jax.tree.map(lambda leaf: leaf[..., lanes], (goal, state))
             return jax.tree.map(lambda leaf: np.asarray(leaf)[..., : total - first], run(*some))
 
-        firsts = range(0, total, self._width)
-        if self._workers == 1 or len(firsts) == 1:
+        firsts = range(0, total, width)
+        if self.workers == 1 or len(firsts) == 1:
             return [part(first) for first in firsts]
-        with ThreadPoolExecutor(self._workers) as threads:
+        with ThreadPoolExecutor(self.workers) as threads:
             return list(threads.map(part, firsts))
 
 

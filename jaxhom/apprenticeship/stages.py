@@ -29,12 +29,15 @@ def in_turn(request: Request, *methods: Callable[[Request], Found]) -> Found:
         if not left.size:
             break
         old = found.part(left)
-        start = {"policy": old.x, "weights": old.weights, "value": old.value, "spent": old.iterations}
-        new = method(request.part(left, **start))
+        limit = None if request.limit is None else int((request.limit - old.iterations).min())
+        new = method(request.part(left, policy=old.x, weights=old.weights, value=old.value, limit=limit))
+        iterations = old.iterations + new.iterations
         is_worse = np.flatnonzero(~(new.gap < old.gap) & np.isfinite(old.gap))
         if is_worse.size:
-            new = new.with_lanes(is_worse, dataclasses.replace(old.part(is_worse), iterations=new.iterations[is_worse]))
-        found = found.with_lanes(left, new)
+            new = new.with_lanes(is_worse, old.part(is_worse))
+        is_out = iterations >= (np.inf if request.limit is None else request.limit)
+        stopped = np.where(is_out, Status.ITERATION_LIMIT, new.stopped)
+        found = found.with_lanes(left, dataclasses.replace(new, iterations=iterations, stopped=stopped))
     return found
 
 

@@ -12,9 +12,9 @@ import pytest
 import small_models
 
 from jaxhom import LPAL, MDP, Status, gridworld, lpal
-from jaxhom.apprenticeship import certificate, column_rounds, flow, interior_point, presolve, quickest
+from jaxhom.apprenticeship import certificate, column_rounds, interior_point, pdhg, presolve, quickest
 
-METHODS = ["columns", "flow", "interior_point", "auto"]
+METHODS = ["columns", "pdhg", "interior_point", "auto"]
 
 
 class Instance(NamedTuple):
@@ -156,7 +156,7 @@ def test_a_larger_gridworld(name):
     assert_solved(lpal(here.mdp, expectations), here.arrays, expectations, 1e-3)
 
 
-@pytest.mark.parametrize("method", ["columns", "flow"])
+@pytest.mark.parametrize("method", ["columns", "pdhg"])
 def test_the_policy_that_the_expectations_came_from_is_optimal(method):
     """Regions add up to a constant, so v* = 0; as a first guess the policy closes the gap at once."""
     here = grid(8)
@@ -435,7 +435,7 @@ def test_a_prepared_model_gives_the_same_and_prepares_nothing_twice(name, method
         (certificate, "Exact"),
         (presolve.Reach, "of"),
         (interior_point, "Program"),
-        (flow, "FlowProgram"),
+        (pdhg, "FlowProgram"),
         (column_rounds, "with_compact_features"),
     ):
         count_calls(monkeypatch, owner, what, counts)

@@ -104,9 +104,14 @@ class Rounds:
         ]
         for lane in lanes:
             lane.idle += 1
-        for chunk, answers in self._in_chunks(self._respond, asked):
+        same: dict[bytes, list[tuple[Lane, float]]] = {}
+        for lane, pull in asked:  # what several lanes ask is answered once: at first all have the same weights
+            same.setdefault(lane.query(pull).tobytes(), []).append((lane, pull))
+        groups = iter(same.values())
+        for chunk, answers in self._in_chunks(self._respond, [group[0] for group in same.values()]):
             for k, (lane, _) in enumerate(chunk):
-                self._take(lane, {name: array[k] for name, array in answers.items()})
+                others = [other for other, _ in next(groups)[1:]]
+                self._take(lane, {name: array[k] for name, array in answers.items()}, others)
 
     def _respond(self, asked: list[tuple[Lane, float]]) -> dict[str, np.ndarray]:
         goals = [lane.tolerance for lane, _ in asked]
@@ -126,12 +131,21 @@ class Rounds:
         arrays = (np.asarray(array, self._mdp.dtype) for array in arrays)
         return jax.tree.map(np.asarray, respond(self._mdp, *arrays, self._error))
 
-    def _take(self, lane: Lane, answer: dict[str, np.ndarray]) -> None:
-        lane.made, lane.has_asked, lane.guess = lane.made + 1, lane.has_asked or lane.guess is None, None
+    def _take(self, lane: Lane, answer: dict[str, np.ndarray], others: list[Lane]) -> None:
+        """The answer to a lane's query; to others that asked the same, it costs nothing."""
+        lane.made += 1
+        column = None
         if np.isfinite(answer["expected"]).all():
-            lane.add([self._pool.add(answer["occupancy"], answer["actions"], answer["expected"])], self._room)
-        if np.isfinite(answer["value"]).all():
-            lane.value = answer["value"]
+            column = self._pool.add(answer["occupancy"], answer["actions"], answer["expected"])
+        if np.isfinite(answer["margin_bound"]) and np.isfinite(answer["value"]).all():
+            most = answer["margin_bound"] + answer["weights"] @ lane.expectations
+            self._pool.add_cut(answer["weights"], most, answer["actions"], answer["value"])
+        for one in (lane, *others):
+            one.has_asked, one.guess = one.has_asked or one.guess is None, None
+            if column is not None:
+                one.add([column], self._room)
+            if np.isfinite(answer["value"]).all():
+                one.value = answer["value"]
         lane.take_bound(answer)
 
     # ------------------------------------------------------------------------------------------------------- games
@@ -140,11 +154,24 @@ class Rounds:
         """The game over every lane's columns: a lower bound, its mixture, and weights for the next query.
 
         Policies that other lanes have met join where they are better than what the game has; then it is played again.
+        Bounds that they have proved count for all.
         """
+        for lane in lanes:
+            if cut := self._pool.best_cut(lane.expectations):
+                lane.take_bound(cut)
         self._play([lane for lane in lanes if lane.columns.size])
         self._play([lane for lane in lanes if self._join_from_pool(lane)])
         for lane in lanes:
             lane.gaps.append(lane.gap)
+
+    def welcome(self, lanes: list[Lane]) -> None:
+        """Lanes that have not begun, and have nothing to begin with, learn what is in the pool."""
+        new = [lane for lane in lanes if not (lane.gaps or lane.columns.size or lane.guess is not None)]
+        if self._request.weights is None and len(self._pool.expected):
+            for lane in new:
+                worth = (self._pool.expected - lane.expectations).min(axis=1)
+                lane.add(np.argsort(worth)[-_FROM_POOL:], self._room)
+            self.play_games(new)
 
     def _join_from_pool(self, lane: Lane) -> bool:
         """Adds the policies that are worth most at the query; False if none is worth much more than the lane's own."""

@@ -86,8 +86,11 @@ class Columns:
         waiting, busy = lanes[::-1], []
         with tqdm(disable=not self._progress, desc="LPAL", unit="column") as bar:
             while waiting or busy:
-                while waiting and len(busy) < self._most:
-                    busy.append(waiting.pop())
+                new = [waiting.pop() for _ in range(min(len(waiting), self._most - len(busy)))]
+                self._rounds.welcome(new)
+                busy += [lane for lane in new if not lane.is_done(self._limit)]
+                if not busy:
+                    continue
                 self._rounds.respond_to(busy)
                 self._rounds.play_games(busy)
                 _show(bar, busy, len(busy) + len(waiting))

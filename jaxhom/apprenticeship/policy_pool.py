@@ -1,9 +1,13 @@
-"""The pool of LPAL on columns: the policies that any lane has met, for all lanes to use."""
+"""The pool of LPAL on columns: the policies that any lane has met, and the bounds, for all lanes to use.
+
+A *cut* is what planning for weights w has proved: no policy's w . V is above h. The upper bound of any lane is then
+h - w . Vhat at the most.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -28,6 +32,8 @@ class PolicyPool:
         self._action_dtype = np.min_scalar_type(mdp.num_actions - 1)
         self._expected = np.zeros((_FIRST_SIZE, mdp.num_features))
         self._policies: list[tuple[np.ndarray, np.ndarray]] = []
+        self._cuts = np.zeros((_FIRST_SIZE, mdp.num_features + 1))  # w and h
+        self._plans: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
     def expected(self) -> Float[np.ndarray, "M K"]:
@@ -43,11 +49,33 @@ class PolicyPool:
         """Takes a policy, given by actions [S] or probabilities [S, A], with mu [S] and V [K]; returns its number."""
         policy = policy.astype(self._action_dtype) if policy.ndim == 1 else policy
         number = len(self._policies)
-        if number == len(self._expected):
-            self._expected = np.concatenate([self._expected, np.zeros_like(self._expected)])
+        self._expected = _with_room(self._expected, number)
         self._expected[number] = expected
         self._policies.append((occupancy.copy(), policy))
         return number
+
+    def add_cut(
+        self,
+        weights: Float[np.ndarray, " K"],
+        most: float,
+        actions: Int[np.ndarray, " S"],
+        value: Float[np.ndarray, " S"],
+    ) -> None:
+        """Takes the cut of weights [K] and the largest w . V, with the best actions [S] and their values [S]."""
+        number = len(self._plans)
+        self._cuts = _with_room(self._cuts, number)
+        self._cuts[number] = [*weights, most]
+        self._plans.append((actions.astype(self._action_dtype), value.copy()))
+
+    def best_cut(self, expectations: Float[np.ndarray, " K"]) -> dict[str, Any] | None:
+        """The least upper bound for expectations [K]: margin_bound, weights [K], actions [S] and value [S]."""
+        if not self._plans:
+            return None
+        cuts = self._cuts[: len(self._plans)]
+        bounds = cuts[:, -1] - cuts[:, :-1] @ expectations
+        best = int(bounds.argmin())
+        actions, value = self._plans[best]
+        return {"margin_bound": bounds[best], "weights": cuts[best, :-1], "actions": actions, "value": value}
 
     def mixture(self, numbers: Sequence[int], probabilities: Sequence[float]) -> Float[np.ndarray, "S A"]:
         """The occupancy sum_j q_j x_j [S, A] of policies mixed with the given probabilities."""
@@ -64,3 +92,8 @@ class PolicyPool:
     def one_hot(self, actions: Int[np.ndarray, "*B S"]) -> Float[Array, "*B S A"]:
         """Actions [..., S] as a policy [..., S, A]."""
         return jax.nn.one_hot(actions, self._num_actions, dtype=self._dtype)
+
+
+def _with_room(table: Float[np.ndarray, "N M"], number: int) -> Float[np.ndarray, "R M"]:
+    """The table, twice as long where it has no row of this number."""
+    return table if number < len(table) else np.concatenate([table, np.zeros_like(table)])

@@ -11,7 +11,7 @@ from jaxhom import interrupts
 
 interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
 
-from jaxhom.apprenticeship.lpal import LPAL, LPALSolution, lpal
+from jaxhom.apprenticeship.lpal import LPAL, LPALMethod, LPALSolution, lpal
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
@@ -51,6 +51,7 @@ __all__ = [
     "Generalization",
     "Gridworld",
     "ImpossibleStepsWarning",
+    "LPALMethod",
     "LPALSolution",
     "LocalSimilarity",
     "Plan",

@@ -188,6 +188,7 @@ class Certifier:
             margin_bound=high,
             weights=weights,
             iterations=found.iterations.astype(np.int32),
+            decided_by=found.decided_by.astype(np.int32),
             status=np.where(is_closed, Status.SOLVED, found.stopped).astype(np.int32),
         )
 

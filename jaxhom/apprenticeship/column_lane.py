@@ -42,7 +42,7 @@ class Lane:
       lower, mixture: the best lower bound so far, and the policies and probabilities that prove it.
       guess: [K] or None, the next query instead of a mixture.
       gaps: after each round. made: policies added by this lane. idle: rounds without progress.
-      has_moved: the bound is better than that of the first query.
+      has_asked: there was a query that was no guess. has_moved: the bound is better than that of the first query.
     """
 
     expectations: Float[np.ndarray, " K"]
@@ -61,6 +61,7 @@ class Lane:
     guess: Float[np.ndarray, " K"] | None = None
     gaps: list[float] = dataclasses.field(default_factory=list)
     idle: int = 0
+    has_asked: bool = False
     has_moved: bool = False
 
     @property

@@ -19,7 +19,7 @@ from jaxhom.apprenticeship.exact import NEAR_ONE, Exact
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.responses import evaluate, evaluate_on_host, respond, respond_on_host, with_compact_features
-from jaxhom.apprenticeship.solution import Found
+from jaxhom.apprenticeship.solution import Found, LPALMethod
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning.occupancy import policy_from_occupancy
 from jaxhom.solvers.game_interior_point import GameSolution
@@ -66,11 +66,11 @@ class Rounds:
 
     def _lane(self, number: int) -> Lane:
         asked = self._request
-        expectations, spent = asked.expectations[number], 0 if asked.spent is None else int(asked.spent[number])
+        expectations = asked.expectations[number]
         uniform = np.full(len(expectations), 1.0 / len(expectations))
         weights = uniform if asked.weights is None else asked.weights[number]
-        value = np.zeros(self._mdp.num_states) if asked.value is None else asked.value[number]
-        return Lane(expectations, float(asked.tolerance[number]), value, weights, made=spent)
+        value = np.zeros(self._mdp.num_states) if asked.value is None else np.nan_to_num(asked.value[number])
+        return Lane(expectations, float(asked.tolerance[number]), value, weights)
 
     def add_policies(self, lanes: list[Lane], x: Float[np.ndarray, "C S A"]) -> None:
         """A column for each lane: the policy, which may be stochastic, of an occupancy up to scale (eq. 5)."""
@@ -127,7 +127,7 @@ class Rounds:
         return jax.tree.map(np.asarray, respond(self._mdp, *arrays, self._error))
 
     def _take(self, lane: Lane, answer: dict[str, np.ndarray]) -> None:
-        lane.made, lane.guess = lane.made + 1, None
+        lane.made, lane.has_asked, lane.guess = lane.made + 1, lane.has_asked or lane.guess is None, None
         if np.isfinite(answer["expected"]).all():
             lane.add([self._pool.add(answer["occupancy"], answer["actions"], answer["expected"])], self._room)
         if np.isfinite(answer["value"]).all():
@@ -178,7 +178,7 @@ class Rounds:
         chunks = [items[first : first + self._width] for first in range(0, len(items), self._width)]
         return zip(chunks, self._run(work, chunks), strict=True)
 
-    def found(self, lanes: list[Lane]) -> Found:
+    def found(self, lanes: list[Lane], offered_by: LPALMethod) -> Found:
         """What all lanes end with. A lane whose programs all failed has nothing: its policy is anybody's guess."""
         shape = self._mdp.num_states, self._mdp.num_actions
         x = [np.zeros(shape) if lane.mixture is None else self._pool.mixture(*lane.mixture) for lane in lanes]
@@ -189,6 +189,8 @@ class Rounds:
             weights=np.stack([lane.weights for lane in lanes]),
             value=np.stack([nothing if lane.best_value is None else lane.best_value for lane in lanes]),
             iterations=counts,
+            gap=np.array([lane.gap for lane in lanes]),
+            decided_by=np.array([LPALMethod.COLUMNS if lane.has_asked else offered_by for lane in lanes]),
             stopped=np.where(counts >= self._limit, Status.ITERATION_LIMIT, Status.STALLED),
             negligible=_NO_OCCUPANCY,
         )

@@ -29,7 +29,7 @@ from tqdm import tqdm
 from jaxhom.apprenticeship.column_lane import Lane
 from jaxhom.apprenticeship.column_rounds import Rounds
 from jaxhom.apprenticeship.request import Request
-from jaxhom.apprenticeship.solution import Found
+from jaxhom.apprenticeship.solution import Found, LPALMethod
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.chain_solver import is_solved_by_lu
 from jaxhom.solvers.lane_queue import num_cores
@@ -110,9 +110,9 @@ class Columns:
         """The lanes that are not closed and have iterations left."""
         return np.array([k for k, lane in enumerate(self._lanes) if not lane.is_done(self._limit)], int)
 
-    def found(self) -> Found:
-        """What all lanes end with."""
-        return self._rounds.found(self._lanes)
+    def found(self, offered_by: LPALMethod = LPALMethod.COLUMNS) -> Found:
+        """What all lanes end with. Those that had no query of their own are decided by whoever offered theirs."""
+        return self._rounds.found(self._lanes, offered_by)
 
 
 def _workers_and_width(mdp: MDP, total: int) -> tuple[int, int]:

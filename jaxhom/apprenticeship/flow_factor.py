@@ -30,7 +30,7 @@ def factor_entries(mdp: MDP) -> tuple[Blocks, int]:
     flow = abs(flow_matrix(mdp))
     pattern = flow.toarray() @ flow.toarray().T if mdp.is_dense else flow @ flow.T
     blocks = order_in_blocks(scipy.sparse.csr_array(pattern))
-    return blocks, 3 * blocks.count * blocks.size**2
+    return blocks, 2 * blocks.count * blocks.size**2
 
 
 def split_flow(mdp: MDP, unit: Float[np.ndarray, " K"], dtype: DTypeLike) -> tuple[Splitting, Int[np.ndarray, " S"]]:
@@ -71,14 +71,7 @@ def _factor(mdp: MDP, features: Float[np.ndarray, "S A K"], blocks: Blocks, dtyp
     schur = phi.T @ phi + np.eye(phi.shape[1]) - cross.T @ behind
     lower, diagonal = factor.unit_factor()
     ordered = behind[blocks.order]
-    arrays = {
-        "lower": lower,
-        "upper": np.roll(lower, -1, axis=0).transpose(0, 2, 1),
-        "diagonal": diagonal,
-        "behind": ordered,
-        "behind_transpose": ordered.T,
-        "schur": np.linalg.inv(schur),
-    }
+    arrays = {"lower": lower, "diagonal": diagonal, "behind": ordered, "schur": np.linalg.inv(schur)}
     return FlowFactor(**{name: checks.to_device(np.ascontiguousarray(array), dtype) for name, array in arrays.items()})
 
 

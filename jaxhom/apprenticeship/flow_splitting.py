@@ -51,24 +51,21 @@ class FlowFactor(Record):
 
     Attributes:
       lower: [nb, n, n], the block left of the diagonal in the block Cholesky factor with unit diagonal; 0 in the first.
-      upper: [nb, n, n], the transpose of the next of these; 0 in the last.
       diagonal: [nb, n, n], inverses of the factor's diagonal blocks.
-      behind: [S, K], (F F^T)^-1 F Phi. behind_transpose: [K, S].
+      behind: [S, K], (F F^T)^-1 F Phi.
       schur: [K, K], inverse of the feature rows' Schur complement.
     """
 
     lower: Float[Array, "nb n n"]
-    upper: Float[Array, "nb n n"]
     diagonal: Float[Array, "nb n n"]
     behind: Float[Array, "S K"]
-    behind_transpose: Float[Array, "K S"]
     schur: Float[Array, "K K"]
 
     def solve(
         self, flow: Float[Array, "S lanes"], expected: Float[Array, "K lanes"]
     ) -> tuple[Float[Array, "S lanes"], Float[Array, "K lanes"]]:
         """(y, m) with M M^T (y, m) = (flow, expected)."""
-        on_features = self.schur @ (expected - self.behind_transpose @ flow)
+        on_features = self.schur @ (expected - self.behind.T @ flow)
         return self._solve_flow(flow) - self.behind @ on_features, on_features
 
     def _solve_flow(self, right: Float[Array, "S lanes"]) -> Float[Array, "S lanes"]:
@@ -82,14 +79,14 @@ class FlowFactor(Record):
             reduced = right - lower @ before
             return reduced, reduced
 
-        def backwards(behind, block):
-            upper, right = block
-            solution = right - upper @ behind
-            return solution, solution
+        def backwards(known, block):
+            lower, right = block
+            solution = right - known
+            return lower.T @ solution, solution
 
         zeros = jnp.zeros_like(right[0])
         _, reduced = jax.lax.scan(forwards, zeros, (self.lower, right))
-        _, solution = jax.lax.scan(backwards, zeros, (self.upper, self.diagonal @ reduced), reverse=True)
+        _, solution = jax.lax.scan(backwards, zeros, (self.lower, self.diagonal @ reduced), reverse=True)
         return solution.reshape(count * size, lanes)[:num_states]
 
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from jaxhom.apprenticeship.certificate import simplex_point
 from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.request import Request
-from jaxhom.apprenticeship.solution import Found
+from jaxhom.apprenticeship.solution import Found, LPALMethod
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.flow_matrix import flow_matrix
 from jaxhom.solvers.normal_equations import Rows
@@ -102,4 +102,12 @@ def solve_by_interior_point(request: Request) -> Found:
     x, weights, value = (np.stack([getattr(point, name) for point in points]) for name in ("x", "weights", "value"))
     stopped = [Status.ITERATION_LIMIT if point.status == Status.ITERATION_LIMIT else Status.STALLED for point in points]
     steps = np.array([point.steps for point in points])
-    return Found(x=x, weights=weights, value=value, iterations=steps, stopped=np.array(stopped))
+    return Found(
+        x=x,
+        weights=weights,
+        value=value,
+        iterations=steps,
+        stopped=np.array(stopped),
+        decided_by=np.full(len(steps), LPALMethod.INTERIOR_POINT),
+        gap=np.array([0.0 if point.status == Status.SOLVED else np.inf for point in points]),
+    )

@@ -10,12 +10,13 @@ margin v is worth at least the expert's value plus v times the sum of the weight
 A call is checked, presolved (`presolve` takes out what no policy can reach) and handed to a method as a `Request`; what
 the method has found is certified: `certificate` computes the true margin of the policy that is returned and the best
 upper bound; and `sensitivity` gives the margin its derivatives. A method is a function from `Request` to `Found`, and
-a line of `METHODS`. `columns` plays the game over policies, `flow` runs PDHG on the linear program itself,
-`interior_point` a sparse interior-point method on the same, and `quickest` chooses.
+a line of `METHODS`. `columns` plays the game over policies, `pdhg` runs a first-order method on the linear program
+itself, `interior_point` an interior-point method on the same, and `quickest` chooses.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -33,7 +34,7 @@ from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectation
 from jaxhom.apprenticeship.quickest import solve_by_the_quickest
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.sensitivity import with_derivatives, without_tangents
-from jaxhom.apprenticeship.solution import Found, LPALSolution
+from jaxhom.apprenticeship.solution import Found, LPALMethod, LPALSolution
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP
 
@@ -47,10 +48,12 @@ METHODS: dict[str, Callable[[Request], Found]] = {
     "pdhg": solve_by_pdhg,
 }
 
+FORMER_METHODS = {"flow": "pdhg"}
+
 _LARGEST = 2.0**-20  # share of the largest number of a type: what sums of expectations may need stays within it
 _FLOAT32_GOAL = 0.5  # share of the tolerance that methods aim for: the rest is for what the model's rounding hides
 
-__all__ = ["LPAL", "LPALSolution", "lpal"]
+__all__ = ["LPAL", "LPALMethod", "LPALSolution", "lpal"]
 
 
 def lpal(
@@ -81,11 +84,12 @@ def lpal(
         [0, 1] that reach both that is 1e-5 / (1 - discount).
       method: "columns"; "interior_point", one lane at a time, for models whose graph is a narrow band (grids) and any
         number of features; "auto" for the quicker of these two, or both together;
-        or "flow" for PDHG on the linear program with exact projections on the flow, all lanes at once: an independent
-        second opinion, slower, for models whose graph is a narrow band or that have up to a few thousand states.
+        or "pdhg", a first-order method on the linear program with exact projections on the flow, all lanes at once, for
+        models whose graph is a narrow band or that have up to a few thousand states; lanes that it does not close are
+        handed on to the others. "flow" is its former name, which warns.
       max_iterations: what to stop after, per lane, whichever method runs; `status` is then ITERATION_LIMIT. It counts
         columns, that is best responses ("columns", default 500), interior-point steps ("interior_point", 100), both
-        together ("auto", 500) or PDHG iterations ("flow", in sixteens; 20,000, one to seven thousand are usual).
+        together ("auto", 500), or PDHG iterations, in tens, and what follows them ("pdhg", 250 and 500).
       progress: show a progress bar of the largest gap.
 
     Returns:
@@ -101,7 +105,7 @@ def lpal(
     Raises:
       ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
         distributions or that does what is not allowed, a warm start that is none, a model without features, numbers so
-        large that their sums over time overflow, an unknown method, a model too large for method "flow"; under jit or
+        large that their sums over time overflow, an unknown method, a model too large for method "pdhg"; under jit or
         vmap; on second derivatives.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
@@ -114,7 +118,7 @@ def lpal(
       >>> print(bool(solution.margin_bound - solution.margin <= 0.01))
       True
     """
-    _check_method(method)
+    method = _checked_method(method)
     options = {"tolerance": tolerance, "method": method, "max_iterations": max_iterations, "progress": progress}
     return LPAL(mdp).solve(expectations, initial_policy=initial_policy, warm_start=warm_start, **options)
 
@@ -165,7 +169,7 @@ class LPAL:
         progress: bool = False,
     ) -> LPALSolution:
         """`lpal` on the prepared model; see there for arguments, results and errors."""
-        _check_method(method)
+        method = _checked_method(method)
         given = expectations
         expectations, initial_policy, warm_start = without_tangents((expectations, initial_policy, warm_start))
         _refuse_traced(expectations, initial_policy, warm_start)
@@ -206,9 +210,14 @@ def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tol
 # ------------------------------------------------------------------------------------------------------------- checks
 
 
-def _check_method(method: str) -> None:
+def _checked_method(method: str) -> str:
+    """A method of the table; under its former name with a warning."""
+    if isinstance(method, str) and method in FORMER_METHODS:
+        warnings.warn(f"method={method!r} is now called {FORMER_METHODS[method]!r}", DeprecationWarning, stacklevel=3)
+        return FORMER_METHODS[method]
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method must be one of {tuple(METHODS)}, got {method!r}")
+    return method
 
 
 def _refuse_traced(*trees) -> None:

@@ -33,7 +33,6 @@ class Request:
       lanes: int [B], the numbers that these lanes have in the call.
       policy: [B, S, A] or None. weights: [B, K] or None. What to begin with.
       value: [B, S] or None, guesses of the optimal values for these weights, in the model's units.
-      spent: int [B], iterations that count already.
       limit: iterations of a lane; None for what the method takes to be enough.
       progress: whether to show a bar.
     """
@@ -46,7 +45,6 @@ class Request:
     policy: Float[np.ndarray, "B S A"] | None = None
     weights: Float[np.ndarray, "B K"] | None = None
     value: Float[np.ndarray, "B S"] | None = None
-    spent: Int[np.ndarray, " B"] | None = None
     limit: int | None = None
     progress: bool = False
 
@@ -56,7 +54,7 @@ class Request:
 
     def part(self, numbers: Int[np.ndarray, " C"], **changes) -> Request:
         """The request of some lanes, counted within this one, with the given fields exchanged."""
-        by_lane = ("expectations", "tolerance", "lanes", "policy", "weights", "value", "spent")
+        by_lane = ("expectations", "tolerance", "lanes", "policy", "weights", "value")
         parts = {name: None if (leaf := getattr(self, name)) is None else leaf[numbers] for name in by_lane}
         return self.replace(**parts | changes)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,22 @@ if TYPE_CHECKING:
     from jaxtyping import Array, Float, Int
 
 
+class LPALMethod(enum.IntEnum):
+    """The method whose policy and weights a solution of LPAL has; `method` says which was asked for.
+
+    Example:
+      >>> import jaxhom
+      >>> mdp = jaxhom.gridworld(4, num_regions=4).mdp
+      >>> solution = jaxhom.lpal(mdp, [30.0, 10.0, 10.0, 10.0], method="interior_point")
+      >>> print(jaxhom.LPALMethod(int(solution.decided_by)).name)
+      INTERIOR_POINT
+    """
+
+    COLUMNS = 0
+    INTERIOR_POINT = 1
+    PDHG = 2
+
+
 class LPALSolution(Record):
     """A policy with its margin and a bound on the best margin; a batch adds a leading axis [B] to every field.
 
@@ -21,12 +38,14 @@ class LPALSolution(Record):
 
     Attributes:
       policy: [S, A], rows sum to 1.
-      occupancy: [S, A], of that policy; sums to 1 / (1 - discount).
+      occupancy: [S, A], of that policy, as far as the margin needs it; sums to 1 / (1 - discount).
       margin: scalar, min_i V_i(policy) - expectations_i, the true margin of the returned policy, rounded down; by less
         than a twentieth of the tolerance where the gap is closed.
       margin_bound: scalar, no policy's margin is larger; rounded up.
       weights: [K], the reward weights that prove `margin_bound`: non-negative, sum 1.
-      iterations: int32 scalar: columns, interior-point steps or PDHG iterations.
+      iterations: int32 scalar: columns, interior-point steps and PDHG iterations.
+      decided_by: int32 scalar, a `jaxhom.LPALMethod`: PDHG where its own weights or policy closed the lane, with the
+        best responses to them; COLUMNS where columns had to go on from there.
       status: int32 scalar, a `jaxhom.Status`.
     """
 
@@ -36,6 +55,7 @@ class LPALSolution(Record):
     margin_bound: Float[Array, "*B"]
     weights: Float[Array, "*B K"]
     iterations: Int[Array, "*B"]
+    decided_by: Int[Array, "*B"]
     status: Int[Array, "*B"]
 
 
@@ -47,6 +67,8 @@ class Found:
       x: [B, S, A], an occupancy up to scale and rounding, whose policy (eq. 5) is meant.
       weights: [B, K], about in the simplex.
       iterations: int [B]. stopped: [B], the status of a lane whose gap turns out to be open.
+      decided_by: int [B], an `LPALMethod`.
+      gap: [B], what the method takes to be open; infinite where it does not know.
       value: [B, S], guesses of the optimal values for the weights, in the method's units; or None.
       negligible: share of all discounted time below which x is taken for nothing; of each lane [B], or of all.
     """
@@ -55,6 +77,8 @@ class Found:
     weights: Float[np.ndarray, "B K"]
     iterations: Int[np.ndarray, " B"]
     stopped: Int[np.ndarray, " B"]
+    decided_by: Int[np.ndarray, " B"]
+    gap: Float[np.ndarray, " B"]
     value: Float[np.ndarray, "B S"] | None = None
     negligible: Float[np.ndarray, " B"] | float = NO_OCCUPANCY
 

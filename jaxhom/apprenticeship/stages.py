@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,32 +12,41 @@ from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found
 from jaxhom.status import Status
 
+if TYPE_CHECKING:
+    from jaxtyping import Int
+
 
 def in_turn(request: Request, *methods: Callable[[Request], Found]) -> Found:
     """What the first method finds, and for the lanes that it leaves open the next ones.
 
-    A method begins with the policy, weights and values of those before it, and what it finds counts only where its
-    certificate is better. The iterations of a lane are those of all methods.
+    A method begins with the policies, weights and values of those before it, and what it finds counts only where it
+    leaves less open. The iterations of a lane are those of all methods.
     """
     first, *others = methods
     found = first(request)
     for method in others:
-        solution = request.certified(found)
-        is_left = solution.status != Status.SOLVED
-        if request.limit is not None:
-            is_left &= solution.iterations < request.limit
-        left = np.flatnonzero(is_left)
+        left = _left_open(request, found)
         if not left.size:
             break
-        old, gap = found.part(left), (solution.margin_bound - solution.margin)[left]
-        start = {"policy": solution.policy[left], "weights": solution.weights[left], "spent": solution.iterations[left]}
-        asked = request.part(left, value=old.value, **start)
-        new = method(asked)
-        certified = asked.certified(new)
-        is_worse = np.flatnonzero(~(certified.margin_bound - certified.margin < gap))
+        old = found.part(left)
+        limit = None if request.limit is None else int((request.limit - old.iterations).min())
+        new = method(request.part(left, policy=old.x, weights=old.weights, value=old.value, limit=limit))
+        iterations = old.iterations + new.iterations
+        is_worse = np.flatnonzero(~(new.gap < old.gap) & np.isfinite(old.gap))
         if is_worse.size:
-            counts = new.iterations
             new = new.with_lanes(is_worse, old.part(is_worse))
-            new.iterations[is_worse] = counts[is_worse]
-        found = found.with_lanes(left, new)
+        is_out = iterations >= (np.inf if request.limit is None else request.limit)
+        stopped = np.where(is_out, Status.ITERATION_LIMIT, new.stopped)
+        found = found.with_lanes(left, dataclasses.replace(new, iterations=iterations, stopped=stopped))
     return found
+
+
+def _left_open(request: Request, found: Found) -> Int[np.ndarray, " C"]:
+    """The lanes that are open by the method's own account, or by the certificate, and have iterations left."""
+    is_open = ~(found.gap <= request.tolerance)
+    closed = np.flatnonzero(~is_open)
+    if closed.size:
+        is_open[closed] = request.part(closed).certified(found.part(closed)).status != Status.SOLVED
+    if request.limit is not None:
+        is_open &= found.iterations < request.limit
+    return np.flatnonzero(is_open)

@@ -13,8 +13,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxhom import interrupts
+from jaxhom.apprenticeship.lpal import FORMER_METHODS, lpal
 from jaxhom.apprenticeship.lpal import METHODS as LPAL_METHODS
-from jaxhom.apprenticeship.lpal import lpal
 from jaxhom.cli import pictures, results
 from jaxhom.cli.methods import METHODS, add_method_options, check_method, generalize, wants_progress
 from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_model_options
@@ -60,9 +60,9 @@ def add_parser(commands: Any) -> None:
         "--lpal",
         nargs="?",
         const=_LPAL_METHODS[0],
-        choices=_LPAL_METHODS,
+        choices=(*_LPAL_METHODS, *FORMER_METHODS),
         metavar="SOLVER",
-        help="feed the policy's feature expectations to LPAL; solved by columns, interior_point, flow, or by the "
+        help="feed the policy's feature expectations to LPAL; solved by columns, interior_point, pdhg, or by the "
         "quicker of the first two: auto (default)",
     )
     group.add_argument(

@@ -12,7 +12,8 @@ from jaxhom import Status
 from jaxhom.apprenticeship import lpal as lpal_module
 from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.prepared import PreparedModel
-from jaxhom.apprenticeship.solution import Found
+from jaxhom.apprenticeship.solution import Found, LPALMethod
+from jaxhom.apprenticeship.stages import in_turn
 
 
 def request_for(case, count=3):
@@ -25,6 +26,7 @@ def found_for(case, count=3, seed=0, **fields):
     x = rng.uniform(size=(count, *case.shape))
     weights = rng.dirichlet(np.ones(case.features.shape[2]), size=count)
     counts, stopped = np.arange(count), np.full(count, Status.STALLED)
+    fields = {"gap": np.full(count, np.inf), "decided_by": np.full(count, LPALMethod.COLUMNS)} | fields
     return Found(x=x, weights=weights, iterations=counts, stopped=stopped, **fields)
 
 
@@ -83,3 +85,48 @@ def test_what_is_prepared_is_made_once_in_units_of_about_one():
     for _ in range(2):
         model.once(made.append)
     assert len(made) == 2 and made[1] is model.mdp
+
+
+# ------------------------------------------------------------------------------------------------------------- stages
+
+
+def stage(case, gap, iterations, seed, seen):
+    """A method that claims a gap for each lane of the call, and says what it was asked."""
+
+    def method(request):
+        seen.append(request)
+        found = found_for(case, len(request.lanes), seed, gap=np.asarray(gap, float)[request.lanes])
+        return dataclasses.replace(found, iterations=np.full(len(request.lanes), iterations))
+
+    return method
+
+
+def test_methods_take_lanes_in_turn():
+    """Open lanes are handed on with what was found; a worse answer is not taken; iterations add up."""
+    case, seen = small_models.case("dense"), []
+    request, _ = request_for(case)
+    first = stage(case, [np.inf, 5.0, 3.0], 4, 0, seen)
+    second = stage(case, [7.0, 2.0, 4.0], 10, 1, seen)
+    found = in_turn(request.replace(limit=30), first, second)
+    alone = first(request), second(request)
+    assert [len(one.lanes) for one in seen[:2]] == [3, 3]
+    np.testing.assert_array_equal(seen[1].policy, alone[0].x)
+    np.testing.assert_array_equal(seen[1].weights, alone[0].weights)
+    assert seen[1].limit == 26
+    np.testing.assert_array_equal(found.gap, [7.0, 2.0, 3.0])
+    for lane, method in enumerate((1, 1, 0)):
+        np.testing.assert_array_equal(found.x[lane], alone[method].x[lane])
+    np.testing.assert_array_equal(found.iterations, [14, 14, 14])
+
+
+def test_what_a_method_takes_for_closed_is_certified():
+    """Claims that the certificate does not bear out are handed on; lanes without iterations left are not."""
+    case, seen = small_models.case("dense"), []
+    request, _ = request_for(case)
+    last = stage(case, [1.0, 1.0, 1.0], 1, 2, seen)
+    in_turn(request, stage(case, [0.0, np.nan, 1.0], 4, 0, []), last)
+    np.testing.assert_array_equal(seen[-1].lanes, [0, 1, 2])
+    found = in_turn(request.replace(limit=5), stage(case, [0.0, 9.0, 1.0], 4, 0, []), last, last)
+    assert len(seen) == 2
+    np.testing.assert_array_equal(found.iterations, 5)
+    np.testing.assert_array_equal(found.stopped, Status.ITERATION_LIMIT)

@@ -91,6 +91,7 @@ def _our_row(contest: Contest, method: str, solver: str, options: dict, batch: b
     try:
         found = measure(solver, options, lanes, contest.limit, package="jaxhom", together=batch, compiles=True)
         fields = contest.judged(found)
+        fields["note"] = ", ".join(filter(None, (fields["note"], f"{found.peak_gb:.2g} GB at most")))
         if batch and sum(found.seconds) > contest.limit:
             fields["note"] += f", took longer than {contest.limit:g} s"
     except NoAnswer as error:

@@ -37,6 +37,10 @@ class Instance:
       weights: (seed, lane, K) -> reward weights [K] of the lane's expert.
       expectations: "exact", "perturbed" or "monte_carlo".
       horizon: steps of each demonstration, for Monte Carlo.
+      gap: that is asked for, as a share of 1 / (1 - discount), all features being within [0, 1]; the library's default
+        if None.
+      most_lanes: that are measured.
+      has_peers: whether other solvers are.
     """
 
     title: str
@@ -44,6 +48,9 @@ class Instance:
     weights: Callable[[int, int, int], np.ndarray]
     expectations: str = "perturbed"
     horizon: int = 0
+    gap: float | None = None
+    most_lanes: int | None = None
+    has_peers: bool = True
 
     def draw(self, seed: int, lanes: int) -> tuple[jaxhom.MDP, np.ndarray]:
         """The model, and expectations [B, K] of `lanes` experts."""
@@ -174,6 +181,7 @@ LPAL = {
     "bumps48": _bumps(48),
     "grid100": _regions(100, 100),
     "grid316": _regions(316, 100),
+    "grid1000": dataclasses.replace(_regions(1000, 100), gap=0.01, most_lanes=1, has_peers=False),  # 3.2 GB of features
     "garnet": Instance("dense Garnet, S = 500, K = 32", dense_garnet, uniform),
     "racetrack_a": _track("a"),
     "racetrack_b": _track("b"),

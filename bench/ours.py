@@ -15,7 +15,7 @@ from bench import instances  # noqa: E402
 
 
 class _Solver:
-    """Calls `function(mdp, *lane)`; `read_off` makes (answers, statuses, iterations) of what it returns."""
+    """Calls `function(mdp, *lane)`; `read_off` makes (answers, statuses, methods, iterations) of what it returns."""
 
     def __init__(self, mdp: jaxhom.MDP, function, read_off):
         self._mdp, self._function, self._read_off = jax.block_until_ready(mdp), function, read_off
@@ -33,23 +33,31 @@ class _Solver:
         return jax.block_until_ready(self._function(self._mdp, *self._lane))
 
     def read(self, found) -> list:
-        """Answers, statuses and iterations, lane by lane."""
+        """Answers, the library's words and iterations, lane by lane."""
         parts = self._read_off(jax.tree.map(np.asarray, found))
         parts = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if self._alone else np.asarray(leaf), parts)
         lanes = [jax.tree.map(lambda leaf, k=k: leaf[k], parts) for k in range(self._count)]
-        return [
-            (answer, "" if status is None else jaxhom.Status(int(status)).name, int(iterations or 0))
-            for answer, status, iterations in lanes
-        ]
+        return [(answer, _words(status, method), int(iterations or 0)) for answer, status, method, iterations in lanes]
 
 
-def lpal(name: str, method: str | None, **_) -> _Solver:
-    """LPAL on an instance; a lane is (expectations,), its answer (x, w)."""
+def _words(status: np.ndarray | None, method: np.ndarray | None) -> str:
+    """How a lane ended, and which method decided it where the library says so."""
+    words = [] if status is None else [jaxhom.Status(int(status)).name]
+    words += [] if method is None else [f"by {jaxhom.LPALMethod(int(method)).name.lower()}"]
+    return " ".join(words)
+
+
+def lpal(name: str, method: str | None, tolerance: float | None = None, **_) -> _Solver:
+    """LPAL on an instance; a lane is (expectations,), its answer (x, w). The default tolerance if None."""
     options = {} if method is None else {"method": method}
+
+    def read_off(found):
+        return (found.occupancy, found.weights), found.status, getattr(found, "decided_by", None), found.iterations
+
     return _Solver(
         instances.LPAL[name].build(),
-        lambda mdp, expectations: jaxhom.lpal(mdp, expectations, **options),
-        lambda found: ((found.occupancy, found.weights), found.status, found.iterations),
+        lambda mdp, expectations: jaxhom.lpal(mdp, expectations, tolerance=tolerance, **options),
+        read_off,
     )
 
 
@@ -60,8 +68,8 @@ def planning(name: str, work: str, tolerance: float, **_) -> _Solver:
         return _Solver(
             mdp,
             lambda mdp, reward, _: jaxhom.optimal_policy(mdp, reward, tolerance=tolerance),
-            lambda found: (found.policy.argmax(axis=-1), None, found.iterations),
+            lambda found: (found.policy.argmax(axis=-1), None, None, found.iterations),
         )
     if work == "occupancy":
-        return _Solver(mdp, lambda mdp, _, policy: jaxhom.occupancy(mdp, policy), lambda x: (x, None, None))
-    return _Solver(mdp, lambda mdp, r, policy: jaxhom.policy_value(mdp, policy, r), lambda v: (v, None, None))
+        return _Solver(mdp, lambda mdp, _, policy: jaxhom.occupancy(mdp, policy), lambda x: (x, None, None, None))
+    return _Solver(mdp, lambda mdp, r, policy: jaxhom.policy_value(mdp, policy, r), lambda v: (v, None, None, None))

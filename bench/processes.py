@@ -21,7 +21,10 @@ import itertools
 import math
 import multiprocessing
 import os
+import pathlib
+import resource
 import statistics
+import sys
 import time
 from collections.abc import Iterator
 
@@ -51,6 +54,7 @@ class Found:
       seconds: per lane; of lanes that were solved together, the whole divided by their number.
       build_s, compile_s: see above.
       processes: that shared the lanes.
+      peak_gb: the most memory that one of them held.
     """
 
     answers: list
@@ -60,6 +64,7 @@ class Found:
     build_s: float
     compile_s: float
     processes: int = 1
+    peak_gb: float = 0.0
 
 
 def measure(
@@ -111,7 +116,8 @@ def measure(
     ]
     seconds = max(sum(part.seconds) for part in parts) / len(lists[0])
     build, compile_s = (max(getattr(part, name) for part in parts) for name in ("build_s", "compile_s"))
-    return Found(*lists, [seconds] * len(lists[0]), build, compile_s, processes)
+    peak = max(part.peak_gb for part in parts)
+    return Found(*lists, [seconds] * len(lists[0]), build, compile_s, processes, peak)
 
 
 class Worker:
@@ -222,4 +228,14 @@ def run(
         build, slowest = build + build_s, max(slowest, median)
         answers += getattr(found, "read", list)(solved)
         seconds += [median / len(group)] * len(group)
-    yield Found(*map(list, zip(*answers, strict=True)), seconds, build, compile_s)
+    yield Found(*map(list, zip(*answers, strict=True)), seconds, build, compile_s, peak_gb=_peak_gb())
+
+
+def _peak_gb() -> float:
+    """The most memory that this process held, in 1e9 bytes."""
+    status = pathlib.Path("/proc/self/status")
+    if status.exists():  # `getrusage` begins at what the parent held
+        lines = (line.split() for line in status.read_text().splitlines())
+        return next((1024e-9 * int(words[1]) for words in lines if words[0] == "VmHWM:"), 0.0)
+    unit = 1.0 if sys.platform == "darwin" else 1024.0
+    return 1e-9 * unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

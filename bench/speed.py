@@ -63,6 +63,7 @@ KINDS = {
         sections=(  # the instances, small ones first
             *("grid16", "grid16_exact", "grid16_monte_carlo", "grid24", "bumps24", "grid32", "grid48", "grid48_exact"),
             *("grid48_monte_carlo", "garnet", "racetrack_a", "racetrack_b", "bumps48", "grid100", "grid316"),
+            "grid1000",
         ),
         quick=("grid16", "racetrack_b"),
         fields=(

@@ -167,6 +167,11 @@ _LPAL_HEADER = [
     "| method | one, s | gap | against best peer | batch | each, s | gap | against best peer | compile s |",
     "|:--" + "|--:" * 8 + "|",
 ]
+_OURS_HEADER = [
+    "| instance | one: quickest of ours | s | default takes | batch: quickest of ours | each, s | default takes |",
+    "|:--|:--|--:|--:|:--|--:|--:|",
+]
+_DEFAULT = "jaxhom"
 
 
 def lpal_best_peers(rows: list[dict]) -> dict[tuple[str, bool], float]:
@@ -179,9 +184,37 @@ def lpal_best_peers(rows: list[dict]) -> dict[tuple[str, bool], float]:
     return {(name, True): seconds for (name, _), seconds in best.items()} | best
 
 
+def lpal_quickest_of_ours(rows: list[dict]) -> dict[tuple[str, bool], tuple[dict, float | None]]:
+    """By section and whether in a batch: our quickest row, and how many times as long the default method takes.
+
+    None where the default has no row, or leaves lanes open.
+    """
+    found: dict = {}
+    for row in sorted(filter(is_ours, filter(is_settled, rows)), key=lambda row: number(row, "seconds")):
+        found.setdefault((row["section"], is_batch(row)), []).append(row)
+    times = {}
+    for key, members in found.items():
+        default = next((row for row in members if row["method"] == _DEFAULT), None)
+        times[key] = members[0], number(default, "seconds") / number(members[0], "seconds") if default else None
+    return times
+
+
+def _ours_cells(name: str, section: str, quickest: dict) -> list[str]:
+    """One line: the instance, and for one lane and for a batch who is the quickest."""
+    cells = [name]
+    for batch in (False, True):
+        row, ratio = quickest.get((section, batch), (None, None))
+        method = "" if row is None else "default" if row["method"] == _DEFAULT else row["method"].split()[-1]
+        cells += [method.replace("_", " "), *shown(row, seconds=".3g"), "" if ratio is None else f"{ratio:.2f} times"]
+    return cells
+
+
 def lpal_table(rows: list[dict]) -> str:
-    """A table for each instance: a line per method, one lane and a batch."""
-    best, parts = lpal_best_peers(rows), []
+    """Who of ours is the quickest, and a table for each instance: a line per method, one lane and a batch."""
+    best, quickest = lpal_best_peers(rows), lpal_quickest_of_ours(rows)
+    names = {row["section"]: row.get("instance") or row["section"] for row in rows}
+    ours = [_ours_cells(name, section, quickest) for section, name in names.items()]
+    parts = [("The default against each of our methods", _OURS_HEADER, ours)]
     for section in dict.fromkeys(row["section"] for row in rows):
         members = sorted((row for row in rows if row["section"] == section), key=lambda row: not is_ours(row))
         sizes = ", ".join(f"{name} = {members[0][name]}" for name in ("S", "A", "K") if members[0].get(name))

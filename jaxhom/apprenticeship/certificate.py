@@ -3,6 +3,9 @@
 Any policy bounds v* from below by its margin min_i V_i(pi) - Vhat_i, one linear solve. Any w in the simplex bounds it
 from above by max_pi w . V(pi) - w . Vhat, one planning problem. Neither relies on how pi or w were found. Both are
 computed in float64 (`exact`), whatever the model's type, and rounded outwards.
+
+What a method has found is nearly the occupancy of its policy, and its values those of planning: all lanes are first
+judged by what these guesses prove, one product for each side. Only where that says too little is a chain factorised.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.apprenticeship.exact import NEAR_ONE, Exact, exact_rows, rounded_down
+from jaxhom.apprenticeship.exact import ENOUGH, NEAR_ONE, Exact, exact_rows, rounded_down
 from jaxhom.apprenticeship.presolve import Reduction
 from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.mdp import MDP
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _EPS = np.finfo(np.float64).eps
+_NUMBERS_AT_A_TIME = 2**18  # of the policies of several lanes: they stay in a core's cache
 
 
 class ExactSides:
@@ -43,19 +47,29 @@ class ExactSides:
         self._by_host_alone = self.exact.model.is_narrow or (is_rough and self.exact.is_direct)
 
     def below(
-        self, policy: Float[np.ndarray, "S A"], expectations: Float[np.ndarray, " K"], tolerance: float
+        self,
+        policy: Float[np.ndarray, "S A"],
+        expectations: Float[np.ndarray, " K"],
+        tolerance: float,
+        guess: Float[np.ndarray, " S"] | None = None,
     ) -> tuple[Float[np.ndarray, " S"], float]:
-        """The occupancy of the states, and what the policy's margin is at least; rows sum to exactly 1."""
-        guess = None
-        if not self._by_host_alone:
+        """The occupancy of the states, and what the policy's margin is at least; rows sum to exactly 1.
+
+        `guess`: of the occupancy.
+        """
+        if guess is None and not self._by_host_alone:
             guess = np.asarray(occupancy(self.mdp, policy), np.float64).sum(axis=1)
         mu, margin = None, np.inf
         for exact in self._variants:
             found, expected, error = exact.expectations(policy.astype(np.float64), guess, tolerance)
-            error = error + 2.0 * _EPS * (np.abs(expected) + np.abs(expectations))
             mu, guess = found if mu is None else mu, found
-            margin = min(margin, float((self._masses[:, None] * expected - expectations - error).min()))
+            margin = min(margin, float(self._least(expected[None], error[None], expectations).min()))
         return mu, margin
+
+    def _least(self, expected, error, expectations):
+        """V_k - Vhat_k at least, [B, K], of V [B, K] that are known up to an error."""
+        error = error + 2.0 * _EPS * (np.abs(expected) + np.abs(expectations))
+        return (self._masses[:, None, None] * expected).min(axis=0) - expectations - error
 
     def above(
         self,
@@ -71,9 +85,32 @@ class ExactSides:
         for exact in self._variants:
             bound, value, actions = exact.plan(weights, value, actions, tolerance)
             best = max(best, *(self._masses * bound))
+        return float(self._most(np.array([best]), weights[None], expectations)[0]), actions
+
+    def _most(self, best, weights, expectations):
+        """w . V(pi) - w . Vhat at most, [B], of what the best policies are worth at most."""
         target = weights * expectations
-        rounding = (len(weights) + 4) * _EPS * (np.abs(target).sum() + abs(best))
-        return float(best - target.sum() + rounding), actions
+        rounding = (weights.shape[1] + 4) * _EPS * (np.abs(target).sum(axis=1) + np.abs(best))
+        return best - target.sum(axis=1) + rounding
+
+    def guessed_below(
+        self, policy: Float[np.ndarray, "B S A"], expectations: Float[np.ndarray, "B K"], mu: Float[np.ndarray, "B S"]
+    ) -> tuple[Float[np.ndarray, "B K"], Float[np.ndarray, " B"]]:
+        """V_k(pi) - Vhat_k at least, as guesses of occupancies prove it, and by how much that may be too little."""
+        policy = policy.astype(np.float64)
+        parts = [exact.evaluate(policy, mu) for exact in self._variants]
+        least = np.min([self._least(*part, expectations) for part in parts], axis=0)
+        return least, np.max([error.max(axis=1) for _, error in parts], axis=0)
+
+    def guessed_above(
+        self, weights: Float[np.ndarray, "B K"], expectations: Float[np.ndarray, "B K"], value: Float[np.ndarray, "B S"]
+    ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"], Int[np.ndarray, "B S"]]:
+        """`above` as guesses of values prove it: the bounds, by how much they may be too much, and actions."""
+        weights = weights.astype(np.float64)
+        weights /= weights.sum(axis=1, keepdims=True)
+        parts = [exact.bound(weights, value) for exact in self._variants]
+        best = np.max([np.outer(self._masses, bound).max(axis=0) for bound, *_ in parts], axis=0)
+        return self._most(best, weights, expectations), np.max([part[1] for part in parts], axis=0), parts[0][2]
 
 
 class Certifier:
@@ -96,52 +133,90 @@ class Certifier:
     ):
         self._sides, self._expectations, self._tolerance = sides, expectations, tolerance
         self._reduction, self._unit = reduction, unit
-        self._latest: dict[int, tuple[Found, LPALSolution]] = {}
+        self._latest: dict[int, Found] = {}
+        self._solutions: LPALSolution | None = None
 
     def certify(self, found: Found, lanes: Int[np.ndarray, " C"]) -> LPALSolution:
         """The solutions of the given lanes of the call, NumPy arrays with a leading axis [C].
 
         A lane for which nothing new was found since it was last certified keeps its solution.
         """
-        solutions = [self._certified(int(lane), found.lane(k)) for k, lane in enumerate(lanes)]
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *solutions)
+        news = [found.lane(k) for k in range(len(lanes))]
+        known = [self._latest.get(int(lane)) for lane in lanes]
+        fresh = [k for k, (new, old) in enumerate(zip(news, known, strict=True)) if old is None or not new.is_as(old)]
+        self._latest.update((int(lanes[k]), news[k]) for k in fresh)
+        width = max(1, _NUMBERS_AT_A_TIME // self._sides.exact.allowed.size)
+        for first in range(0, len(fresh), width):
+            some = np.array(fresh[first : first + width])
+            self._keep(lanes[some], self._certify(lanes[some], found.part(some)))
+        return jax.tree.map(lambda leaf: leaf[lanes], self._solutions)
 
-    def _certified(self, lane: int, found: Found) -> LPALSolution:
-        known, solution = self._latest.get(lane, (None, None))
-        if known is None or not found.is_as(known):
-            solution = self._certify(lane, found)
-            self._latest[lane] = found, solution
-        return solution
+    def _keep(self, lanes: Int[np.ndarray, " C"], solutions: LPALSolution) -> None:
+        if self._solutions is None:
+            total = len(self._expectations)
+            self._solutions = jax.tree.map(lambda leaf: np.empty((total, *leaf.shape[1:]), leaf.dtype), solutions)
+        for kept, new in zip(jax.tree.leaves(self._solutions), jax.tree.leaves(solutions), strict=True):
+            kept[lanes] = new
 
-    def _certify(self, lane: int, found: Found) -> LPALSolution:
-        sides, tolerance, asked = self._sides, self._tolerance[lane], self._expectations[lane]
+    def _certify(self, lanes: Int[np.ndarray, " C"], found: Found) -> LPALSolution:
+        sides, tolerance, asked = self._sides, self._tolerance[lanes], self._expectations[lanes]
         dtype = np.dtype(sides.mdp.dtype)
-        weights = self._reduction.weights(lane, simplex_point(found.weights)).astype(dtype)
-        value = None if found.value is None else found.value.astype(np.float64) * self._unit
-        bound, actions = sides.above(weights, asked, value, tolerance)
-        policy = self._policy(found, actions)
-        mu, margin = sides.below(policy, asked, tolerance)
-        # Bounds that rounding has made to cross are both uncertain.
-        low, high = min(margin, bound), max(margin, bound)
-        low, high = rounded_down(low, dtype), -rounded_down(-high, dtype)
-        is_closed = float(high) - float(low) <= tolerance
+        weights = self._reduction.weights(lanes, simplex_point(found.weights)).astype(dtype)
+        x = np.where(sides.exact.allowed, np.nan_to_num(found.x, posinf=0.0, neginf=0.0), 0.0)
+        guess = self._occupancy(x)
+        value = np.zeros(guess.shape) if found.value is None else found.value * self._unit
+        bound, excess, actions = sides.guessed_above(weights, asked, value)
+        policy = self._policy(x, actions, found.negligible)
+        least, lack = sides.guessed_below(policy, asked, guess)
+        margin = least.min(axis=1)
+        # Values are rough where hardly anything happens, and no matter there: what the policy is worth for the weights
+        # is the least that their bound can be.
+        excess = np.minimum(excess, bound - (weights * least).sum(axis=1))
+        is_rough = ~(excess <= ENOUGH * tolerance) & ~_is_closed(margin, bound, tolerance, dtype)
+        for k in np.flatnonzero(is_rough):
+            start = value[k] if found.value is not None else None
+            bound[k], actions[k] = sides.above(weights[k], asked[k], start, tolerance[k])
+        policy[is_rough] = self._policy(x[is_rough], actions[is_rough], found.negligible[is_rough])
+        for k in np.flatnonzero(is_rough | ~(lack <= ENOUGH * tolerance)):
+            guess[k], margin[k] = sides.below(policy[k], asked[k], tolerance[k], guess[k])
+        low, high = _rounded(margin, bound, dtype)
+        is_closed = _is_closed(margin, bound, tolerance, dtype)
         return LPALSolution(
             policy=policy,
-            occupancy=(mu[:, None] * policy).astype(dtype),
+            occupancy=(guess[..., None] * policy).astype(dtype),
             margin=low,
             margin_bound=high,
             weights=weights,
-            iterations=np.int32(found.iterations),
-            decided_by=np.int32(found.decided_by),
-            status=np.int32(Status.SOLVED if is_closed else found.stopped),
+            iterations=found.iterations.astype(np.int32),
+            decided_by=found.decided_by.astype(np.int32),
+            status=np.where(is_closed, Status.SOLVED, found.stopped).astype(np.int32),
         )
 
-    def _policy(self, found: Found, actions: Int[np.ndarray, " S"]) -> Float[np.ndarray, "S A"]:
+    def _occupancy(self, x: Float[np.ndarray, "C S A"]) -> Float[np.ndarray, "C S"]:
+        """A guess of the states' occupancy: that of x, all discounted time together."""
+        exact = self._sides.exact
+        with np.errstate(over="ignore"):
+            mu = np.maximum(x, 0.0).sum(axis=2)
+            total = mu.sum(axis=1, keepdims=True)
+        is_good = (total > 0) & np.isfinite(total)
+        share = np.where(is_good, mu, exact.initial) / np.where(is_good, total, exact.initial.sum())
+        return share * exact.time[1]
+
+    def _policy(self, x, actions, negligible) -> Float[np.ndarray, "C S A"]:
         """Eq. (5); where nothing happens, the best actions for the weights."""
-        exact, mdp = self._sides.exact, self._sides.mdp
-        x = np.where(exact.allowed, np.nan_to_num(found.x, posinf=0.0, neginf=0.0), 0.0)
-        best = np.eye(x.shape[1])[actions]
-        return exact_rows(policy_from_occupancy(mdp, x, best, found.negligible), mdp.dtype)
+        best = np.eye(x.shape[2])[actions]
+        mdp = self._sides.mdp
+        return exact_rows(policy_from_occupancy(mdp, x, best, negligible[:, None]), mdp.dtype)
+
+
+def _rounded(margin: np.ndarray, bound: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+    """Both sides [C], outwards. Bounds that rounding has made to cross are both uncertain."""
+    return rounded_down(np.minimum(margin, bound), dtype), -rounded_down(-np.maximum(margin, bound), dtype)
+
+
+def _is_closed(margin: np.ndarray, bound: np.ndarray, tolerance: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    low, high = _rounded(margin, bound, dtype)
+    return high.astype(np.float64) - low.astype(np.float64) <= tolerance
 
 
 def simplex_point(weights: Float[np.ndarray, "*B K"]) -> Float[np.ndarray, "*B K"]:

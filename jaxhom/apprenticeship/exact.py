@@ -5,14 +5,16 @@ Rows of float32 tables miss the sum 1 by 1e-8, which near a discount of 1 is not
 they should be and for the rows as they are (`as_stored`).
 
 Below. For any guess mu of a policy's state occupancy, with x = mu pi and what misses in the flow,
-r = alpha + gamma T^T x - mu, the expectations are V_i(pi) = phi_i . x + r . v_i, where v_i, the value of feature i, is
-at most max |phi_i| / (1 - gamma): the error is at most |r|_1 max |phi_i| / (1 - gamma).
+r = alpha + gamma T^T x - mu, the expectations are V_i(pi) = phi_i . x + r . v_i. Where v_i, the value of feature i, is
+everywhere within h_i of c_i (half the range of phi_i, and its middle, times 1 / (1 - gamma)), they are within h_i |r|_1
+of phi_i . x + c_i sum(r).
 
 Above. For any values V and b = max_a (r + gamma T V) - V, the optimal value is at most V + max_s b / (1 - gamma)
 (Puterman 1994, section 6.6), and at least V + min_s b / (1 - gamma).
 
-Where a guess is too rough, it is replaced by the solution of the linear system: by LU if the model is small or its
-graph like a road or a grid, otherwise by BiCGSTAB; values by steps of policy iteration.
+What guesses prove takes a product, for many lanes at once (`evaluate`, `bound`). Where a guess is too rough, it is
+replaced by the solution of the linear system (`expectations`, `plan`): by LU if the model is small or its graph like a
+road or a grid, otherwise by BiCGSTAB; values by steps of policy iteration.
 """
 
 from __future__ import annotations
@@ -27,12 +29,12 @@ from jaxhom.models.mdp import MDP
 from jaxhom.planning.host_chains import host_model
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import ArrayLike, Bool, Float, Int
 
 NEAR_ONE = 0.998  # a discount above which linear systems are better solved on the host
 _EPS = np.finfo(np.float64).eps
 _DIRECT = 4e6  # states times bandwidth, up to which LU is quick
-_ENOUGH = 0.05  # share of the tolerance that errors may take without another attempt
+ENOUGH = 0.05  # share of the tolerance that errors may take without another attempt
 _ROUNDINGS = 16.0  # by which a row may miss 1 before that is looked at
 _MAX_IMPROVEMENTS = 200  # of policy iteration; the bound holds wherever it stops
 _MAX_KRYLOV_STEPS, _KRYLOV_RESIDUAL = 500, 1e-13  # to what float64 can give; what is missing widens the bound
@@ -51,15 +53,20 @@ class Exact:
     def __init__(self, mdp: MDP, total: Float[np.ndarray, " S*A"] | None = None):
         """`total` [S A]: what rows of probabilities sum to; 1 if None."""
         self.model, self.allowed = host_model(mdp), np.asarray(mdp.allowed)
+        self._all_allowed = bool(self.allowed.all())
         self._mdp, self._is_given = mdp, total is not None
         self.initial = np.asarray(mdp.initial, np.float64)
         self.discount = float(mdp.discount)
         self.features = compact_features(np.asarray(mdp.features), self.allowed).astype(np.float64)
-        self.size = np.abs(self.features).max(axis=(0, 1))
+        low, high = self.features.min(axis=(0, 1)), self.features.max(axis=(0, 1))
+        self.size, self._has_negative = np.maximum(abs(low), abs(high)), bool(low.min() < 0)
         self.features = self.features.reshape(-1, len(self.size))
         kept = self.discount * (np.ones(1) if total is None else total[self.allowed.ravel()])
         self.time = self.initial.sum() / (1.0 - kept.min()), self.initial.sum() / (1.0 - kept.max())
         self._most = 1.0 / (1.0 - kept.max())
+        times = np.array([[1.0 / (1.0 - kept.min())], [self._most]])
+        low, high = (low * times).min(axis=0), (high * times).max(axis=0)
+        self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low) + 4.0 * _EPS * self._most * self.size
         rows = self.model.rows
         if total is not None:
             rows = (
@@ -100,7 +107,7 @@ class Exact:
         best = None
         if guess is not None and np.isfinite(guess).all():
             best = self._expected(policy, guess)
-        if best is None or not best[2].max() <= _ENOUGH * tolerance:
+        if best is None or not best[2].max() <= ENOUGH * tolerance:
             start = self.initial * self._most if best is None else best[0]
             best = best or self._expected(policy, start)
             found = self._solve(policy, self.initial, start, is_flow=True)
@@ -110,13 +117,31 @@ class Exact:
         return best
 
     def _expected(self, policy, mu):
-        x = mu[:, None] * policy
-        arrived = self.initial + self.discount * (self.rows.T @ x.ravel())
-        missing = np.abs(arrived - mu).sum() + (self._in + 8) * _EPS * (np.abs(arrived).sum() + mu.sum())
-        visits = mu if len(self.features) == len(mu) else x.ravel()
+        expected, error = self.evaluate(policy[None], mu[None])
+        return mu, expected[0], error[0]
+
+    def evaluate(
+        self, policy: Float[np.ndarray, "B S A"], mu: Float[np.ndarray, "B S"]
+    ) -> tuple[Float[np.ndarray, "B K"], Float[np.ndarray, "B K"]]:
+        """What guesses of the occupancies prove, without linear solves.
+
+        Args:
+          policy: [B, S, A], rows sum to exactly 1.
+          mu: [B, S], not negative.
+
+        Returns:
+          (V [B, K], error [B, K]), as `expectations`.
+        """
+        x = (mu[..., None] * policy).reshape(len(mu), -1)
+        arrived = self.initial + self.discount * (self.rows.T @ x.T).T
+        missing = arrived - mu
+        visits = mu if len(self.features) == mu.shape[1] else x
         expected = visits @ self.features
-        rounding = (len(visits) + 8) * _EPS * (visits @ np.abs(self.features))
-        return mu, expected, missing * self.size * self._most + rounding
+        absolute = visits @ np.abs(self.features) if self._has_negative else expected
+        largest, off = self._most * self.size, np.abs(missing).sum(axis=1)[:, None]
+        rounding = (self._in + 8) * (arrived + mu).sum(axis=1)[:, None] + (mu.shape[1] + 8) * off
+        rounding = _EPS * (rounding * largest + (visits.shape[1] + 8) * absolute)
+        return expected + missing.sum(axis=1)[:, None] * self._middle, off * self._half + rounding
 
     def plan(
         self,
@@ -136,51 +161,79 @@ class Exact:
           (bound, value [S], actions [S]): the policy of the actions is optimal up to what is open between the bound and
           its own value; no policy is worth more than the bound.
         """
-        reward, start = self._reward(weights), np.zeros(len(self.initial))
-        size = np.abs(reward).max() + (len(weights) + 2) * _EPS * (weights @ self.size)
-        best, states = np.inf, np.arange(len(start))
+        reward, size = self._reward(weights[None])
+        start, own_reward, states = np.zeros(len(self.initial)), reward[0], np.arange(len(self.initial))
+
+        def bound_of(value, actions):
+            actions = None if actions is None else actions[None]
+            return [part[0] for part in self._bound(reward, size, value[None], actions, len(weights))]
+
+        best = np.inf
         if value is not None and np.isfinite(value).all():
-            best, open_, greedy = self._bound(reward, size, value, None, len(weights))
-            if open_ <= _ENOUGH * tolerance:
+            best, open_, greedy = bound_of(value, None)
+            if open_ <= ENOUGH * tolerance:
                 return best, value, greedy
             start, actions = value, greedy if actions is None else actions
         if actions is None:
-            actions = np.where(self.allowed, reward, -np.inf).argmax(axis=1)
+            actions = np.where(self.allowed, own_reward, -np.inf).argmax(axis=1)
         value = start
         for _ in range(_MAX_IMPROVEMENTS):
-            found = self._solve(actions, reward[states, actions], value, is_flow=False)
+            found = self._solve(actions, own_reward[states, actions], value, is_flow=False)
             if not np.isfinite(found).all():
                 break
             value = found
-            bound, open_, greedy = self._bound(reward, size, value, actions, len(weights))
+            bound, open_, greedy = bound_of(value, actions)
             best = min(best, bound)
-            if open_ <= _ENOUGH * tolerance or (greedy == actions).all():
+            if open_ <= ENOUGH * tolerance or (greedy == actions).all():
                 break
             actions = greedy
         if not np.isfinite(best):
-            best, _, actions = self._bound(reward, size, value, None, len(weights))
+            best, _, actions = bound_of(value, None)
         return best, value, actions
 
-    def _reward(self, weights) -> np.ndarray:
-        reward = (self.features @ weights).reshape(len(self.initial), -1)
-        return np.broadcast_to(reward, self.allowed.shape)
+    def bound(
+        self, weights: Float[np.ndarray, "B K"], value: Float[np.ndarray, "B S"]
+    ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"], Int[np.ndarray, "B S"]]:
+        """What guesses of the optimal values prove, without linear solves.
+
+        Args:
+          weights: [B, K], non-negative.
+          value: [B, S]; what no policy can be worth is cut off.
+
+        Returns:
+          (bound [B], what may be open below it [B], actions [B, S]), as `plan`.
+        """
+        reward, size = self._reward(weights)
+        most = (size * self._most)[:, None]
+        value = np.clip(np.nan_to_num(value), -most, most)
+        return self._bound(reward, size, value, None, weights.shape[1])
+
+    def _reward(self, weights):
+        """w . phi [B, S, A], or [B, S, 1] if it is the same for all actions, and the largest of each [B]."""
+        reward = (weights @ self.features.T).reshape(len(weights), len(self.initial), -1)
+        size = np.abs(reward).max(axis=(1, 2)) + (weights.shape[1] + 2) * _EPS * (weights @ self.size)
+        return np.broadcast_to(reward, (len(weights), *self.allowed.shape)), size
 
     def _bound(self, reward, size, value, actions, num_features):
         """The bound that values prove, what may be open below it, and better actions; those given where none are."""
-        action_value = reward + self.discount * (self.rows @ value).reshape(self.allowed.shape)
-        action_value = np.where(self.allowed, action_value, -np.inf)
-        greedy = action_value.argmax(axis=1)
-        gain = action_value.max(axis=1) - value
-        largest = np.abs(value).max()
+        action_value = np.ascontiguousarray((self.rows @ value.T).T).reshape(reward.shape)
+        action_value *= self.discount
+        action_value += reward
+        if not self._all_allowed:
+            action_value[:, ~self.allowed] = -np.inf
+        greedy = action_value.argmax(axis=2)
+        best = np.take_along_axis(action_value, greedy[..., None], axis=2)[..., 0]
+        gain, largest = best - value, np.abs(value).max(axis=1)
         rounding = (self._out + num_features + 8) * _EPS * (size + 2.0 * largest)
-        at_start, top, least, most = self.initial @ value, gain.max(), *self.time
-        rounding = most * rounding + (len(value) + 8) * _EPS * (self.initial @ np.abs(value) + abs(top) * most)
-        bound = at_start + max(top * least, top * most) + rounding
+        at_start, top, (least, most) = value @ self.initial, gain.max(axis=1), self.time
+        terms = value.shape[1] + 8
+        rounding = most * rounding + terms * _EPS * (np.abs(value) @ self.initial + np.abs(top) * most)
+        bound = at_start + np.maximum(top * least, top * most) + rounding
         if actions is not None:
-            own = np.take_along_axis(action_value, actions[:, None], axis=1)[:, 0]
-            is_better = action_value.max(axis=1) > own + 8.0 * _EPS * (np.abs(own) + largest)
+            own = np.take_along_axis(action_value, actions[..., None], axis=2)[..., 0]
+            is_better = best > own + 8.0 * _EPS * (np.abs(own) + largest[:, None])
             greedy = np.where(is_better, greedy, actions)
-        return bound, most * (top - gain.min()), greedy
+        return bound, most * (top - gain.min(axis=1)), greedy
 
     def _solve(self, policy, right, start, *, is_flow: bool) -> np.ndarray:
         """Solves (I - gamma P_pi) x = right, or with P_pi^T; policy [S, A] or actions [S]. Nobody vouches for x."""
@@ -244,10 +297,11 @@ def exact_rows(policy: Float[np.ndarray, "*B S A"], dtype: np.dtype | type) -> F
     return (steps / count).astype(dtype)
 
 
-def rounded_down(number: float, dtype: np.dtype | type) -> Float[np.ndarray, ""]:
-    """The largest number of the type that is not above the given one."""
-    number = np.float64(number)
+def rounded_down(numbers: Float[ArrayLike, "..."], dtype: np.dtype | type) -> Float[np.ndarray, "..."]:
+    """The largest numbers of the type that are not above the given ones."""
+    numbers = np.asarray(numbers, np.float64)
     with np.errstate(over="ignore"):
-        rounded = number.astype(dtype)
+        rounded = numbers.astype(dtype)
     # In float64: Python numbers would be compared in the shorter type, where the two are equal.
-    return np.nextafter(rounded, np.array(-np.inf, dtype)) if np.float64(rounded) > number else rounded
+    is_above = rounded.astype(np.float64) > numbers
+    return np.where(is_above, np.nextafter(rounded, np.array(-np.inf, dtype)), rounded)

@@ -180,11 +180,13 @@ class LPAL:
             max_iterations = checks.require_count("max_iterations", max_iterations)
         request = _presolved(self._model, batch, tolerance)
         request = request.replace(policy=policy, weights=weights, limit=max_iterations, progress=progress)
-        solution = jax.tree.map(checks.to_device, request.certified(METHODS[method](request)))
+        solution = request.certified(METHODS[method](request))
         if checks.is_traced(self._mdp, given):
             given = jnp.atleast_2d(jnp.asarray(given, self._mdp.dtype))
-            solution = with_derivatives(solution, self._mdp, given)
-        return solution if host.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], solution)
+            solution = with_derivatives(jax.tree.map(checks.to_device, solution), self._mdp, given)
+        if host.ndim == 1:
+            solution = jax.tree.map(lambda leaf: leaf[0], solution)
+        return jax.tree.map(checks.to_device, solution)
 
 
 def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tolerance) -> Request:

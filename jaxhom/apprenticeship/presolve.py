@@ -48,19 +48,17 @@ class Reduction(Record):
     scarcest: Int[np.ndarray, " B"]
     least: Float[np.ndarray, " B"]
 
-    def weights(self, lane: int, weights: np.ndarray) -> np.ndarray:
-        """Weights [K] for the given expectations of a lane from those for the reduced ones.
+    def weights(self, lanes: Int[np.ndarray, " C"], weights: Float[np.ndarray, "C K"]) -> Float[np.ndarray, "C K"]:
+        """Weights for the given expectations of some lanes from those for the reduced ones.
 
         Weight on an idle feature goes to the scarcest one, which is smaller for every policy: the bound that it proves
         can only get better.
         """
-        idle, to = self.is_idle[lane], self.scarcest[lane]
-        if not idle.any():
-            return weights
+        idle, to = self.is_idle[lanes], self.scarcest[lanes][:, None]
         kept = np.where(idle, 0.0, weights)
-        kept[to] = 0.0
-        kept[to] = max(0.0, 1.0 - kept.sum())
-        return kept
+        np.put_along_axis(kept, to, 0.0, axis=1)
+        np.put_along_axis(kept, to, np.maximum(0.0, 1.0 - kept.sum(axis=1, keepdims=True)), axis=1)
+        return np.where(idle.any(axis=1, keepdims=True), kept, weights)
 
 
 class Reach(Record):

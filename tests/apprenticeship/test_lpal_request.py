@@ -60,7 +60,7 @@ def test_a_lane_is_certified_once_as_long_as_nothing_new_is_found(monkeypatch):
     request, expectations = request_for(case)
     certify, seen = Certifier._certify, []
     monkeypatch.setattr(
-        Certifier, "_certify", lambda self, lane, found: seen.append(lane) or certify(self, lane, found)
+        Certifier, "_certify", lambda self, lanes, found: seen.extend(lanes) or certify(self, lanes, found)
     )
     found = found_for(case, value=np.full((3, 7), np.nan))
     first = request.certified(found)

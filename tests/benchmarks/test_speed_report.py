@@ -54,6 +54,26 @@ def test_ratios_are_to_the_best_settled_peer_of_the_same_column(lpal_path):
     assert "failed" in table and "times" not in line["moreau"]
 
 
+def test_the_default_is_held_against_the_quickest_of_ours():
+    others = [
+        lpal_row("jaxhom columns", 1, 0.05),
+        lpal_row("jaxhom pdhg", 1, 0.01, settled=0.0),  # fast, but the gap is open
+        lpal_row("jaxhom columns", 32, 0.02),
+        lpal_row("jaxhom pdhg", 32, 0.5, "grid48"),
+    ]
+    quickest = speed_report.lpal_quickest_of_ours(LPAL_ROWS[:6] + others)
+    named = {key: (row["method"], ratio) for key, (row, ratio) in quickest.items()}
+    assert named == {
+        ("grid16", False): ("jaxhom columns", pytest.approx(4.0)),
+        ("grid16", True): ("jaxhom", 1.0),
+        ("grid48", False): ("jaxhom", 1.0),
+        ("grid48", True): ("jaxhom pdhg", None),
+    }
+    table = speed_report.lpal_table(LPAL_ROWS[:6] + others)
+    assert "| a grid | columns | 0.05 | 4.00 times | default | 0.01 | 1.00 times |" in table
+    assert "| a grid | default | 3 | 1.00 times | pdhg | 0.5 |  |" in table
+
+
 def test_curves_hold_settled_rows_by_states(lpal_path):
     found = speed_report.lpal_curves(speed.read(lpal_path))
     assert found["jaxhom", False] == [(256, 0.2), (2304, 3.0)]

@@ -21,12 +21,14 @@ from jaxhom.apprenticeship.presolve import Reduction
 from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
+from jaxhom.solvers.lane_queue import map_on_cores
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _EPS = np.finfo(np.float64).eps
+_DIGITS = 1e-4  # share of the tolerance by which a margin may be below the true one: guesses of columns are as good
 _NUMBERS_AT_A_TIME = 2**18  # of the policies of several lanes: they stay in a core's cache
 
 
@@ -177,8 +179,13 @@ class Certifier:
             start = value[k] if found.value is not None else None
             bound[k], actions[k] = sides.above(weights[k], asked[k], start, tolerance[k])
         policy[is_rough] = self._policy(x[is_rough], actions[is_rough], found.negligible[is_rough])
-        for k in np.flatnonzero(is_rough | ~(lack <= ENOUGH * tolerance)):
-            guess[k], margin[k] = sides.below(policy[k], asked[k], tolerance[k], guess[k])
+        is_short = np.flatnonzero(is_rough | ~(lack <= _DIGITS * tolerance))
+
+        def evaluate(k: int) -> tuple[Float[np.ndarray, " S"], float]:
+            return sides.below(policy[k], asked[k], _DIGITS / ENOUGH * tolerance[k], guess[k])
+
+        for k, (mu, least) in zip(is_short, map_on_cores(evaluate, is_short), strict=True):
+            guess[k], margin[k] = mu, least
         low, high = _rounded(margin, bound, dtype)
         is_closed = _is_closed(margin, bound, tolerance, dtype)
         return LPALSolution(

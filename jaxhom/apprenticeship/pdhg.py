@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, TypeVar
 
 import jax
@@ -31,7 +30,7 @@ from jaxhom.apprenticeship.solution import Found, LPALMethod
 from jaxhom.apprenticeship.stages import in_turn
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.occupancy import occupancy
-from jaxhom.solvers.lane_queue import num_cores
+from jaxhom.solvers.lane_queue import map_on_cores, num_cores
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -168,10 +167,7 @@ class FlowProgram:
             return jax.tree.map(lambda leaf: np.asarray(leaf)[..., : total - first], run(*some))
 
         firsts = range(0, total, width)
-        if self.workers == 1 or len(firsts) == 1:
-            return [part(first) for first in firsts]
-        with ThreadPoolExecutor(self.workers) as threads:
-            return list(threads.map(part, firsts))
+        return [part(first) for first in firsts] if self.workers == 1 else map_on_cores(part, firsts)
 
 
 @jax.jit

@@ -109,6 +109,15 @@ def num_cores() -> int:
     return min(_MAX_WORKERS, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
+def map_on_cores(function: Callable[[Any], Any], items: Sequence) -> list:
+    """`function` of every item, on all cores: for work of the host in which Python waits for compiled code."""
+    workers = min(num_cores(), len(items))
+    if workers <= 1:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(workers) as threads:
+        return list(threads.map(function, items))
+
+
 def is_settled(lower, upper, tolerance, threshold=np.nan):
     """bool [P]: bounds [P] are as close as `tolerance`, or decide `value <= threshold` up to it; NumPy or JAX.
 

@@ -70,12 +70,8 @@ def optimum(arrays, expectations):
     return oracles.lpal(*arrays, np.asarray(expectations, np.float64))[0]
 
 
-def assert_certified(solution, arrays, expectations, *, eps=1e-6, slack=np.inf, tolerance=1e-3):
-    """Every claim of one solution, each by an independent road; returns v*. `slack` is what planning may add.
-
-    The margin may be a twentieth of the tolerance below the true one, and the occupancy as far from its own.
-    """
-    lack = 0.05 * tolerance
+def assert_certified(solution, arrays, expectations, *, eps=1e-6, slack=np.inf):
+    """Every claim of one solution, each by an independent road; returns v*. `slack` is what planning may add."""
     transition, discount, initial, features = arrays
     expectations = np.asarray(expectations, np.float64)
     best = optimum(arrays, expectations)
@@ -87,9 +83,10 @@ def assert_certified(solution, arrays, expectations, *, eps=1e-6, slack=np.inf, 
     assert policy.min() >= 0
     # the margin is that of the returned policy, and no policy has a larger one
     margin = oracles.margin(transition, discount, initial, features, expectations, policy)
-    assert margin - eps - lack <= solution.margin <= min(margin, best) + eps
+    np.testing.assert_allclose(solution.margin, margin, rtol=0, atol=eps)
+    assert solution.margin <= best + eps
     occupancy = oracles.occupancy(transition, discount, initial, policy)
-    np.testing.assert_allclose(solution.occupancy, occupancy, rtol=0, atol=10 * eps + 2 * lack)
+    np.testing.assert_allclose(solution.occupancy, occupancy, rtol=0, atol=10 * eps)
     # the bound holds, and the weights prove it
     assert solution.margin_bound >= best - min(eps, 1e-6)
     np.testing.assert_allclose(weights.sum(), 1.0, rtol=0, atol=eps)
@@ -102,7 +99,7 @@ def assert_certified(solution, arrays, expectations, *, eps=1e-6, slack=np.inf, 
 
 
 def assert_solved(solution, arrays, expectations, tolerance):
-    best = assert_certified(solution, arrays, expectations, slack=tolerance, tolerance=tolerance)
+    best = assert_certified(solution, arrays, expectations, slack=tolerance)
     assert solution.status == Status.SOLVED
     assert solution.margin_bound - solution.margin <= tolerance
     assert abs(solution.margin - best) <= tolerance + 1e-6

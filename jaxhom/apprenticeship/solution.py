@@ -40,7 +40,7 @@ class LPALSolution(Record):
       policy: [S, A], rows sum to 1.
       occupancy: [S, A], of that policy, as far as the margin needs it; sums to 1 / (1 - discount).
       margin: scalar, min_i V_i(policy) - expectations_i, the true margin of the returned policy, rounded down; by less
-        than a twentieth of the tolerance where the gap is closed.
+        than a tenth of the tolerance where the gap is closed.
       margin_bound: scalar, no policy's margin is larger; rounded up.
       weights: [K], the reward weights that prove `margin_bound`: non-negative, sum 1.
       iterations: int32 scalar: columns, interior-point steps and PDHG iterations.

@@ -73,9 +73,9 @@ def optimum(arrays, expectations):
 def assert_certified(solution, arrays, expectations, *, eps=1e-6, slack=np.inf, tolerance=1e-3):
     """Every claim of one solution, each by an independent road; returns v*. `slack` is what planning may add.
 
-    The margin may be a twentieth of the tolerance below the true one, and the occupancy as far from its own.
+    The margin may be a tenth of the tolerance below the true one, and the occupancy as far from its own.
     """
-    lack = 0.05 * tolerance
+    lack = 0.1 * tolerance
     transition, discount, initial, features = arrays
     expectations = np.asarray(expectations, np.float64)
     best = optimum(arrays, expectations)

@@ -24,7 +24,7 @@ def test_monte_carlo_expectations(num_regions):
         best = oracles.lpal(*arrays, np.asarray(expectations[lane]))[0]
         assert solution.margin[lane] - 1e-8 <= best <= solution.margin_bound[lane] + 1e-8
         true = oracles.margin(*arrays, np.asarray(expectations[lane]), np.asarray(solution.policy[lane]))
-        assert true - 0.05 * 1e-3 <= solution.margin[lane] <= true + 1e-9
+        assert true - 0.1 * 1e-3 <= solution.margin[lane] <= true + 1e-9
     assert (solution.status == jaxhom.Status.SOLVED).all()
 
 

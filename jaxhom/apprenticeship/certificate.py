@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _EPS = np.finfo(np.float64).eps
 _DIGITS = 1e-4  # share of the tolerance by which a margin may be below the true one: guesses of columns are as good
+_LARGEST = 2.0**500  # of x: sums over it stay finite
 _NUMBERS_AT_A_TIME = 2**18  # of the policies of several lanes: they stay in a core's cache
 
 
@@ -164,9 +165,10 @@ class Certifier:
         sides, tolerance, asked = self._sides, self._tolerance[lanes], self._expectations[lanes]
         dtype = np.dtype(sides.mdp.dtype)
         weights = self._reduction.weights(lanes, simplex_point(found.weights)).astype(dtype)
-        x = np.where(sides.exact.allowed, np.nan_to_num(found.x, posinf=0.0, neginf=0.0), 0.0)
+        x = np.where(sides.exact.allowed, np.clip(np.nan_to_num(found.x, posinf=0.0), 0.0, _LARGEST), 0.0)
         guess = self._occupancy(x)
-        value = np.zeros(guess.shape) if found.value is None else found.value * self._unit
+        with np.errstate(over="ignore"):
+            value = np.zeros(guess.shape) if found.value is None else found.value * self._unit
         bound, excess, actions = sides.guessed_above(weights, asked, value)
         policy = self._policy(x, actions, found.negligible)
         least, lack = sides.guessed_below(policy, asked, guess)
@@ -174,11 +176,13 @@ class Certifier:
         # Values are rough where hardly anything happens, and no matter there: what the policy is worth for the weights
         # is the least that their bound can be.
         excess = np.minimum(excess, bound - (weights * least).sum(axis=1))
-        is_rough = ~(excess <= ENOUGH * tolerance) & ~_is_closed(margin, bound, tolerance, dtype)
+        is_closed = _is_closed(margin, bound, tolerance, dtype)
+        is_rough = ~(excess <= ENOUGH * tolerance) & ~is_closed
         for k in np.flatnonzero(is_rough):
             start = value[k] if found.value is not None else None
             bound[k], actions[k] = sides.above(weights[k], asked[k], start, tolerance[k])
-        policy[is_rough] = self._policy(x[is_rough], actions[is_rough], found.negligible[is_rough])
+        if is_rough.any():
+            policy[is_rough] = self._policy(x[is_rough], actions[is_rough], found.negligible[is_rough])
         is_short = np.flatnonzero(is_rough | ~(lack <= _DIGITS * tolerance))
 
         def evaluate(k: int) -> tuple[Float[np.ndarray, " S"], float]:
@@ -201,12 +205,9 @@ class Certifier:
 
     def _occupancy(self, x: Float[np.ndarray, "C S A"]) -> Float[np.ndarray, "C S"]:
         """A guess of the states' occupancy: that of x, all discounted time together."""
-        exact = self._sides.exact
-        with np.errstate(over="ignore"):
-            mu = np.maximum(x, 0.0).sum(axis=2)
-            total = mu.sum(axis=1, keepdims=True)
-        is_good = (total > 0) & np.isfinite(total)
-        share = np.where(is_good, mu, exact.initial) / np.where(is_good, total, exact.initial.sum())
+        exact, mu = self._sides.exact, x.sum(axis=2)
+        total = mu.sum(axis=1, keepdims=True)
+        share = np.where(total > 0, mu, exact.initial) / np.where(total > 0, total, exact.initial.sum())
         return share * exact.time[1]
 
     def _policy(self, x, actions, negligible) -> Float[np.ndarray, "C S A"]:

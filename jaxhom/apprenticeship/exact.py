@@ -170,6 +170,7 @@ class Exact:
 
         best = np.inf
         if value is not None and np.isfinite(value).all():
+            value = np.clip(value, -size * self._most, size * self._most)
             best, open_, greedy = bound_of(value, None)
             if open_ <= ENOUGH * tolerance:
                 return best, value, greedy

@@ -186,7 +186,7 @@ class LPAL:
             solution = with_derivatives(jax.tree.map(checks.to_device, solution), self._mdp, given)
         if host.ndim == 1:
             solution = jax.tree.map(lambda leaf: leaf[0], solution)
-        return jax.tree.map(checks.to_device, solution)
+        return jax.device_put(solution)
 
 
 def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tolerance) -> Request:

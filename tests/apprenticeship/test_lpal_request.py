@@ -8,12 +8,14 @@ import oracles
 import pytest
 import small_models
 
+import jaxhom
 from jaxhom import Status
 from jaxhom.apprenticeship import lpal as lpal_module
 from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.solution import Found, LPALMethod
 from jaxhom.apprenticeship.stages import in_turn
+from jaxhom.planning.host_chains import HostModel
 
 
 def request_for(case, count=3):
@@ -73,6 +75,66 @@ def test_a_lane_is_certified_once_as_long_as_nothing_new_is_found(monkeypatch):
         asked = expectations[2 if lane else 1]
         true = oracles.margin(*case.arrays, asked, np.asarray(solution.policy[lane]))
         np.testing.assert_allclose(solution.margin[lane], true, rtol=0, atol=1e-9)
+
+
+NONSENSE = {
+    "NaN": np.nan,
+    "infinite": np.inf,
+    "negative": -1.0,
+    "nothing": 0.0,
+    "huge": 1e308,
+    "tiny": 1e-320,
+}
+
+
+@pytest.mark.parametrize("name", NONSENSE)
+@pytest.mark.parametrize("case", ["dense", "restart"])
+def test_bounds_hold_whatever_is_found(case, name):
+    """Everything nonsense, and some of it: the policy is one, and its margin and the bound are true."""
+    case = small_models.case(case)
+    request, expectations = request_for(case)
+    found = found_for(case, value=np.random.default_rng(1).uniform(size=(3, case.shape[0])))
+    for leaf in (found.x, found.value, found.weights):
+        leaf[0], leaf[1, :2] = NONSENSE[name], NONSENSE[name]
+    solution = request.certified(found)
+    for lane, asked in enumerate(expectations):
+        policy, weights = np.asarray(solution.policy[lane]), solution.weights[lane]
+        np.testing.assert_array_equal(policy.sum(axis=1), 1.0)
+        assert solution.margin[lane] <= oracles.margin(*case.arrays, asked, policy) + 1e-9
+        best, _ = oracles.optimal_value(case.transition, case.discount, case.features @ weights)
+        proved = best @ case.initial - weights @ asked
+        assert proved - 1e-9 <= solution.margin_bound[lane] <= proved + 1e-3
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-12, 1e-3])
+def test_guesses_that_say_enough_need_no_factor(noise, monkeypatch):
+    """The best policy and the values for its weights: a product each, unless they are off by more than matters."""
+    mdp = jaxhom.gridworld(6, num_regions=4).mdp
+    arrays = [np.asarray(leaf) for leaf in (mdp.transition, mdp.discount, mdp.initial, mdp.features)]
+    weights = np.array([0.1, 0.2, 0.3, 0.4])
+    best, action_value = oracles.optimal_value(*arrays[:2], arrays[3] @ weights)
+    policy = np.eye(4)[action_value.argmax(axis=1)]
+    x, rng = oracles.occupancy(*arrays[:3], policy), np.random.default_rng(0)
+    expectations = oracles.feature_expectations(*arrays, policy)[None]
+    request = lpal_module._presolved(PreparedModel(mdp), expectations, 1e-3)
+    chains, chain = [], HostModel.chain
+    monkeypatch.setattr(HostModel, "chain", lambda self, policy: chains.append(policy) or chain(self, policy))
+    found = Found(
+        x=(x * (1.0 + noise * rng.uniform(size=x.shape)))[None],
+        weights=weights[None],
+        value=(best + noise * rng.uniform(size=best.shape))[None],
+        iterations=np.zeros(1, int),
+        stopped=np.full(1, Status.STALLED),
+        decided_by=np.full(1, LPALMethod.COLUMNS),
+        gap=np.zeros(1),
+    )
+    solution = request.certified(found)
+    assert bool(chains) == (noise == 1e-3)
+    true = oracles.margin(*arrays, expectations[0], np.asarray(solution.policy[0]))
+    np.testing.assert_allclose(solution.margin[0], true, rtol=0, atol=1e-7)
+    assert solution.margin[0] <= true + 1e-9
+    assert -1e-9 <= solution.margin_bound[0] <= 1e-4
+    np.testing.assert_allclose(solution.occupancy[0].sum(), 100.0, rtol=1e-9)
 
 
 def test_what_is_prepared_is_made_once_in_units_of_about_one():

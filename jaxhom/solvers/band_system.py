@@ -229,7 +229,9 @@ def band_system(
     core = scipy.sparse.csr_array(core)
     blocks = _round(order_in_blocks(abs(core) @ abs(core).T, _MIN_BLOCK))
     ordered = _filled(core[blocks.order], blocks)
-    members = scipy.sparse.csr_array((np.ones(len(group)), (group, np.arange(len(group)))), shape=(len(features), len(group)))
+    members = scipy.sparse.csr_array(
+        (np.ones(len(group)), (group, np.arange(len(group)))), shape=(len(features), len(group))
+    )
     phi = scipy.sparse.csr_array(features)[group]
     band, diagonal, left = _band(ordered, blocks)
     crossing, border = _crossing(ordered, phi, blocks)

@@ -150,6 +150,11 @@ class System(Record):
         return len(self.free)
 
     @property
+    def num_columns(self) -> int:
+        rows = self.core
+        return len(rows.transpose.index[0][0]) if isinstance(rows, SparseRows) else rows.values.shape[1]
+
+    @property
     def factor_size(self) -> int:
         """Numbers of a factor, per lane."""
         count, size = self.filling.shape

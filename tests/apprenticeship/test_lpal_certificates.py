@@ -10,13 +10,13 @@ import numpy as np
 import oracles
 import pytest
 import small_models
-from jaxhom.apprenticeship.flow_lp import project_weighted_simplex
 from scipy.optimize import linprog
 
 import jaxhom
 from jaxhom import MDP, Status, lpal
 from jaxhom.apprenticeship import exact as exact_module
 from jaxhom.apprenticeship.exact import Exact, exact_rows, rounded_down
+from jaxhom.apprenticeship.flow_lp import project_weighted_simplex
 from jaxhom.apprenticeship.presolve import Reach, default_tolerance, reduce_expectations
 from jaxhom.solvers.normal_equations import Rows
 

@@ -9,10 +9,10 @@ import numpy as np
 import oracles
 import pytest
 import small_models
-from jaxhom.apprenticeship.flow_lp import FEATURE_SCALE
 
 from jaxhom import MDP, Status, gridworld, lpal
 from jaxhom.apprenticeship import flow, flow_factor
+from jaxhom.apprenticeship.flow_lp import FEATURE_SCALE
 from jaxhom.solvers import pdhg
 
 

@@ -1,11 +1,12 @@
-"""LPAL by a sparse interior-point method on the linear program (2)-(4), lane by lane on the host.
+"""LPAL by an interior-point method on the linear program (2)-(4).
 
     max v   subject to   sum x phi_i / c_i - v / c_i - slack_i = Vhat_i / c_i,   the Bellman flow,   x, slack >= 0,
 
 with c_i the largest |phi_i|. The multipliers of the K feature rows, each divided by c_i, are the weights of the upper
 bound. Pairs that are not allowed have no variable. Made for models whose graph is a narrow band
 (grids: a few milliseconds a step at 48 x 48): where columns would need about as many policies as there are features,
-this takes 5-40 steps.
+this takes 5-40 steps. There, in float64, compiled programs solve the lanes, one per core at a time
+(`band_queue`); all other models go lane by lane on the host (`sparse_interior_point`).
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ class Program:
         """Whether lanes are solved in compiled programs, a few at a time."""
         if not jax.config.jax_enable_x64 or self._mdp.is_dense:
             return False
-        system, blocks = self._system
+        _, blocks = self._system
         num_features = len(self._unit)
         border = len(blocks.order) * num_features * (2 * blocks.size + num_features)
         return blocks.count > 1 and blocks.work + border <= _MOST_COMPILED_WORK * self.work

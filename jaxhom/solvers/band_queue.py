@@ -1,6 +1,6 @@
 """Many linear programs through compiled steps of a few lanes: finished lanes leave, waiting ones take their place.
 
-As `lane_queue`, with the lanes first. On a CPU, a program with few lanes runs on one core, and one is under way on each.
+As `lane_queue`, with the lanes first. On a CPU, a program with few lanes runs on one core; one is under way on each.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _SHARE = 0.25  # of the lanes that end a program
 _MOST_ENTRIES = 2**27  # of the factors of a program: 1 GB
-WIDTH = 1
+WIDTH = 1  # lanes of a program on a CPU: on grid16 4 or 8 took twice as long per lane and step
 
 
 def solve_lanes(
@@ -99,15 +99,20 @@ def _drain(queue: _Queue, system: BandSystem, initial, width: int) -> None:
         if not used:
             return
         owner = np.append(owner, fresh)
-        lanes, points = jax.tree.map(lambda leaf, at=np.resize(owner, width): leaf[at], queue.problem)
+        lanes, points = _taken(queue.problem, np.resize(owner, width))  # surplus lanes repeat the first
         if fresh.size or state is None:
             new = _begin(system, initial, lanes, points)
             state = new if not busy else jax.tree.map(lambda old, new, at=busy: _joined(old, new, at), state, new)
         state, done = _run(system, initial, lanes, state, used)
         done, state = np.asarray(done)[:used], jax.tree.map(np.asarray, state)
-        queue.store(jax.tree.map(lambda leaf, at=np.flatnonzero(done): leaf[at], state), owner[done])
+        queue.store(_taken(state, np.flatnonzero(done)), owner[done])
         order = np.resize(np.append(np.flatnonzero(~done), np.flatnonzero(done)), width)
-        owner, state = owner[~done], jax.tree.map(lambda leaf, at=order: leaf[at], state)
+        owner, state = owner[~done], _taken(state, order)
+
+
+def _taken(tree, numbers: np.ndarray):
+    """Some lanes of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[numbers], tree)
 
 
 def _joined(old, new, busy: int):

@@ -13,6 +13,7 @@ of the host: the same program runs on a GPU. `normal_equations` is the plain ver
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import jax
@@ -81,12 +82,12 @@ def _buckets(lengths: np.ndarray) -> list[slice]:
             break
         cuts.add(int(min(options, key=lambda cut: _padded(lengths, cuts | {int(cut)}))))
     ends = sorted(cuts)
-    return [slice(first, last) for first, last in zip(ends[:-1], ends[1:], strict=True)]
+    return [slice(first, last) for first, last in itertools.pairwise(ends)]
 
 
 def _padded(lengths: np.ndarray, cuts: set[int]) -> int:
     ends = sorted(cuts)
-    return sum((last - first) * int(lengths[last - 1]) for first, last in zip(ends[:-1], ends[1:], strict=True))
+    return sum((last - first) * int(lengths[last - 1]) for first, last in itertools.pairwise(ends))
 
 
 class Factor(Record):

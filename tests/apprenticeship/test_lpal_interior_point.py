@@ -56,6 +56,8 @@ def test_compiled_steps_find_what_the_host_finds(restricts):
     for lane in range(2):
         plain = program.solve(expectations[lane], 1e-6)
         np.testing.assert_allclose(points[lane].weights, plain.weights, atol=1e-5)
-        reached = [np.einsum("sak,sa->k", mdp.features, point.x) - expectations[lane] for point in (points[lane], plain)]
+        reached = [
+            np.einsum("sak,sa->k", mdp.features, point.x) - expectations[lane] for point in (points[lane], plain)
+        ]
         assert reached[0].min() == pytest.approx(reached[1].min(), abs=2e-6)
     assert not points[0].x[~np.asarray(mdp.allowed)].any()

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.sparse
 from tqdm import tqdm
 
+from jaxhom import checks
 from jaxhom.apprenticeship.certificate import simplex_point
 from jaxhom.apprenticeship.exact import compact_features
 from jaxhom.apprenticeship.prepared import PreparedModel
@@ -106,7 +107,7 @@ class Program:
     @functools.cached_property
     def is_compiled(self) -> bool:
         """Whether lanes are solved in compiled programs, a few at a time."""
-        if not jax.config.jax_enable_x64 or self._mdp.is_dense:
+        if self._mdp.is_dense or checks.to_device(np.zeros(1)).dtype != np.float64:
             return False
         _, blocks = self._system
         num_features = len(self._unit)

@@ -76,7 +76,8 @@ def solve(
     best, status = _nowhere(rows, cost, right), Status.STALLED
     taken = 0
     try:
-        point = _start(rows, *program)
+        rows.factor(np.ones(len(cost)))
+        point = start(rows, *program)
         for taken in range(max_iterations + 1):
             residuals = _residuals(rows, *program, point)
             point = point.replace(error=_error(residuals, point), iterations=taken)
@@ -102,14 +103,15 @@ def _nowhere(rows: Rows, cost, right) -> InteriorPoint:
     return InteriorPoint(z=np.ones(len(cost)), f=free, y=np.zeros(len(right)), s=np.ones(len(cost)))
 
 
-def _start(rows: Rows, cost, free_cost, right) -> InteriorPoint:
+def start(
+    rows: Rows, cost: Float[np.ndarray, " m"], free_cost: Float[np.ndarray, " q"], right: Float[np.ndarray, " n"]
+) -> InteriorPoint:
     """Mehrotra's start: the least-norm solutions of both sets of equations, pushed into the interior.
 
     Then s is raised until the products z s are even and weigh as much as the residuals. Where s = 0 is nearly feasible
     (features that sum to a constant, say), the products would otherwise be nothing long before z is feasible, and the
-    steps no longer than the gap between them.
+    steps no longer than the gap between them. `rows` are factorised for d = 1.
     """
-    rows.factor(np.ones(len(cost)))
     y, f = rows.solve(right, np.zeros_like(free_cost))
     z = rows.transpose @ y
     y, _ = rows.solve(rows.matrix @ cost, free_cost)

@@ -9,6 +9,7 @@ import pytest
 
 import jaxhom
 from jaxhom import interop
+from jaxhom.apprenticeship.interior_point import Program
 
 
 @pytest.mark.parametrize("num_regions", [16, 64])
@@ -37,3 +38,26 @@ def test_one_feature_per_state_and_states_that_hardly_occur():
     solution = jaxhom.lpal(mdp, expectations, method="interior_point")
     assert solution.status == jaxhom.Status.SOLVED
     assert solution.margin <= 0.0 <= solution.margin_bound  # states add up to a constant: v* = 0
+
+
+@pytest.mark.parametrize("restricts", [False, True])
+def test_compiled_steps_find_what_the_host_finds(restricts):
+    """On a band, in batches and alone, with and without actions that some states lack."""
+    mdp = jaxhom.gridworld(16, num_regions=4).mdp
+    if restricts:
+        mdp = mdp.replace(allowed=np.random.default_rng(0).random((256, mdp.num_actions)) < 0.9)
+    rng = np.random.default_rng(1)
+    expectations, tolerance = rng.uniform(0.0, 20.0, (3, mdp.num_features)) * [[1.0], [0.1], [1.0]], np.full(3, 1e-6)
+    program = Program(mdp)
+    points = program.solve_many(expectations, tolerance, np.array([100, 100, 2]))
+    assert points[2].steps == 2
+    alone = program.solve_many(expectations[:1], tolerance[:1], np.array([100]))[0]
+    np.testing.assert_allclose(alone.x, points[0].x, atol=1e-6)
+    for lane in range(2):
+        plain = program.solve(expectations[lane], 1e-6)
+        np.testing.assert_allclose(points[lane].weights, plain.weights, atol=1e-5)
+        reached = [
+            np.einsum("sak,sa->k", mdp.features, point.x) - expectations[lane] for point in (points[lane], plain)
+        ]
+        assert reached[0].min() == pytest.approx(reached[1].min(), abs=2e-6)
+    assert not points[0].x[~np.asarray(mdp.allowed)].any()

@@ -5,8 +5,8 @@
 with c_i the largest |phi_i|. The multipliers of the K feature rows, each divided by c_i, are the weights of the upper
 bound. Pairs that are not allowed have no variable. Made for models whose graph is a narrow band
 (grids: a few milliseconds a step at 48 x 48): where columns would need about as many policies as there are features,
-this takes 5-40 steps. There, in float64, compiled programs solve the lanes, one per core at a time
-(`band_queue`); all other models go lane by lane on the host (`sparse_interior_point`).
+this takes 5-40 steps. There, in float64, compiled programs solve batches, one lane per core at a time (`band_queue`);
+few lanes, and all other models, go lane by lane on the host (`sparse_interior_point`).
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 DEFAULT_STEPS = 100
 _MOST_WORK = 3e9  # multiplications of a step: grid100 (bench.instances) takes 4.1 s either way
 _MOST_COMPILED_WORK = 4.0  # of the host's: where features are eliminated before the flow, its factor may be smaller
+_MANY_LANES = 8  # fewer do not pay for compiling, three seconds; of 32 lanes of grid48 each takes half as long
 _MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals: certificates are made of what is left
 
 
@@ -170,7 +171,7 @@ def solve_by_interior_point(request: Request) -> Found:
     program, total = request.model.once(Program), len(request.lanes)
     limit = np.full(total, request.limit or DEFAULT_STEPS)
     with tqdm(desc="LPAL", unit="lane", total=total, disable=not request.progress) as bar:
-        if program.is_compiled:
+        if total >= _MANY_LANES and program.is_compiled:
             points = program.solve_many(request.expectations, request.tolerance, limit, bar.update)
         else:
             points = []

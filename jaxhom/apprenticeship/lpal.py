@@ -82,11 +82,11 @@ def lpal(
         least that any feature can do which may be the smallest: its range, or twice the distance from its largest value
         to the median of the others where that is less (a cliff is not what gaps are measured by). For features within
         [0, 1] that reach both that is 1e-5 / (1 - discount).
-      method: "columns"; "interior_point", one lane at a time, for models whose graph is a narrow band (grids) and any
-        number of features; "auto" for the quicker of these two, or both together;
-        or "pdhg", a first-order method on the linear program with exact projections on the flow, all lanes at once, for
-        models whose graph is a narrow band or that have up to a few thousand states; lanes that it does not close are
-        handed on to the others. "flow" is its former name, which warns.
+      method: "columns"; "interior_point", for models whose graph is a narrow band (grids) and any number of features;
+        "pdhg", a first-order method on the linear program with exact projections on the flow, all lanes at once, for
+        models whose graph is a narrow band or that have up to a few thousand states; or "auto" for the quickest of
+        them. "pdhg" and "auto" hand lanes that a method does not close on to the others: `decided_by` says who closed
+        them. "flow" is the former name of "pdhg", which warns.
       max_iterations: what to stop after, per lane, whichever method runs; `status` is then ITERATION_LIMIT. It counts
         columns, that is best responses ("columns", default 500), interior-point steps ("interior_point", 100), both
         together ("auto", 500), or PDHG iterations, in tens, and what follows them ("pdhg", 250 and 500).

@@ -468,3 +468,31 @@ def test_prepared_models_and_solutions_are_short_when_printed():
     assert repr(prepared).startswith("LPAL(MDP(") and len(repr(prepared)) < 500
     assert "status=[8 SOLVED]" in repr(solution) and len(repr(solution)) < 300
     assert "margin=-" in repr(prepared.solve(here.expectations[0] + 100.0))
+
+
+# ------------------------------------------------------------------------------------- who is asked
+
+
+@pytest.mark.parametrize(
+    ("size", "name", "lanes", "guided", "first"),
+    [
+        (8, "perturbed", 8, False, "pdhg"),
+        (8, "perturbed", 7, False, "interior_point"),
+        (16, "perturbed", 1, False, "interior_point"),
+        (8, "perturbed", 8, True, "columns"),
+        (8, "exact", 8, False, "columns"),
+    ],
+)
+def test_auto_looks_at_lanes_and_at_what_there_is_to_begin_with(size, name, lanes, guided, first, monkeypatch):
+    here, asked = grid(size), []
+    for method in ("columns", "interior_point", "pdhg"):
+        made = getattr(quickest, f"solve_by_{method}")
+        monkeypatch.setattr(
+            quickest,
+            f"solve_by_{method}",
+            lambda request, made=made, method=method, **options: asked.append(method) or made(request, **options),
+        )
+    options = {"initial_policy": here.policy} if guided else {}
+    solution = lpal(here.mdp, np.tile(here.expectations[name], (lanes, 1)), tolerance=0.1, **options)
+    assert asked[0] == first
+    assert (solution.status == Status.SOLVED).all()

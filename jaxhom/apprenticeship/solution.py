@@ -54,7 +54,7 @@ class LPALSolution(Record):
     margin_bound: Float[Array, "*B"]
     weights: Float[Array, "*B K"]
     iterations: Int[Array, "*B"]
-    decided_by: Int[Array, "*B"]
+    decided_by: Int[Array, "*B"] | int = LPALMethod.COLUMNS
     status: Int[Array, "*B"]
 
 

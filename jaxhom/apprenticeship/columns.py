@@ -100,7 +100,8 @@ class Columns:
         """What another method has found for some lanes: what to ask next, and columns where a policy is good enough."""
         lanes = [self._lanes[number] for number in numbers]
         for lane, weights, value in zip(lanes, found.weights, found.value, strict=True):
-            lane.guess, lane.value = weights, value
+            if np.isfinite(value).all():  # iterations in float32 can overflow; then the lane goes on by itself
+                lane.guess, lane.value = weights, value
         some = np.flatnonzero(is_policy)
         self._rounds.add_policies([lanes[k] for k in some], found.x[some])
 

@@ -85,13 +85,13 @@ class Program:
         self._rows, self._shape = Rows(matrix, free_column, num_states), (num_states, mdp.num_actions)
         self._cost, self._initial = np.zeros(matrix.shape[1]), np.asarray(mdp.initial, float)
         self.work = self._rows.work
-        self._mdp, self._is_factorised = mdp, False
+        self._mdp = mdp
 
     def solve(
         self, expectations: Float[np.ndarray, " K"], tolerance: float, *, max_iterations: int = DEFAULT_STEPS
     ) -> Point:
         """One lane, to a gap of the tolerance if all goes well."""
-        right, self._is_factorised = np.concatenate([self._initial, expectations / self._unit]), False
+        right = np.concatenate([self._initial, expectations / self._unit])
         tolerance *= _MARGIN_SHARE
         point = solve(
             self._rows, self._cost, np.array([-1.0]), right, tolerance=tolerance, max_iterations=max_iterations
@@ -132,11 +132,9 @@ class Program:
         limit: Int[np.ndarray, " B"],
         progress: Callable[[int], object] = lambda count: None,
     ) -> list[Point]:
-        """All lanes, as `solve`, in compiled programs."""
+        """All lanes, as `solve`, in compiled programs; `numpy.linalg.LinAlgError` where rounding lets none begin."""
         system, blocks = self._system
-        if not self._is_factorised:
-            self._rows.factor(np.ones(len(self._cost)))
-            self._is_factorised = True
+        self._rows.factor(np.ones(len(self._cost)))
         initial, starts = self._placed(self._initial), []
         right = expectations / self._unit
         for lane in right:
@@ -171,9 +169,8 @@ def solve_by_interior_point(request: Request) -> Found:
     program, total = request.model.once(Program), len(request.lanes)
     limit = np.full(total, request.limit or DEFAULT_STEPS)
     with tqdm(desc="LPAL", unit="lane", total=total, disable=not request.progress) as bar:
-        if total >= _MANY_LANES and program.is_compiled:
-            points = program.solve_many(request.expectations, request.tolerance, limit, bar.update)
-        else:
+        points = _compiled(program, request, limit, bar.update) if total >= _MANY_LANES else None
+        if points is None:
             points = []
             for lane in zip(request.expectations, request.tolerance, limit, strict=True):
                 points.append(program.solve(*lane[:2], max_iterations=lane[2]))
@@ -189,3 +186,13 @@ def solve_by_interior_point(request: Request) -> Found:
         decided_by=np.full(total, LPALMethod.INTERIOR_POINT),
         gap=np.array([0.0 if point.status == Status.SOLVED else np.inf for point in points]),
     )
+
+
+def _compiled(program: Program, request: Request, limit: np.ndarray, progress: Callable) -> list[Point] | None:
+    """The lanes by compiled programs; None where the model has none, or rounding lets none begin."""
+    if not program.is_compiled:
+        return None
+    try:
+        return program.solve_many(request.expectations, request.tolerance, limit, progress)
+    except np.linalg.LinAlgError:  # on the host every lane says for itself how far it came
+        return None

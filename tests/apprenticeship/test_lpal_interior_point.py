@@ -9,6 +9,7 @@ import pytest
 
 import jaxhom
 from jaxhom import interop
+from jaxhom.apprenticeship import interior_point
 from jaxhom.apprenticeship.interior_point import Program
 
 
@@ -61,3 +62,18 @@ def test_compiled_steps_find_what_the_host_finds(restricts):
         ]
         assert reached[0].min() == pytest.approx(reached[1].min(), abs=2e-6)
     assert not points[0].x[~np.asarray(mdp.allowed)].any()
+
+
+def test_a_batch_that_cannot_be_compiled_or_begun_goes_lane_by_lane(monkeypatch):
+    """A factorisation that rounding spoils at the start is no error of the caller's."""
+    mdp = jaxhom.gridworld(8, num_regions=16).mdp
+    expectations = np.random.default_rng(0).uniform(0.0, 8.0, size=(8, 16))
+    expected = jaxhom.lpal(mdp, expectations, method="interior_point")
+
+    def spoiled(*_, **__):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(interior_point.Program, "solve_many", spoiled)
+    solution = jaxhom.lpal(mdp, expectations, method="interior_point")
+    assert (solution.status == jaxhom.Status.SOLVED).all()
+    np.testing.assert_allclose(solution.margin, expected.margin, rtol=0, atol=1e-3)

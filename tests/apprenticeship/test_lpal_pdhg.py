@@ -241,3 +241,20 @@ def test_the_former_name_warns():
     with pytest.warns(DeprecationWarning, match="now called 'pdhg'"):
         former = lpal(mdp, np.zeros(2), method="flow", tolerance=1e-2)
     chex.assert_trees_all_equal(former, lpal(mdp, np.zeros(2), method="pdhg", tolerance=1e-2))
+
+
+def test_iterations_that_overflow_are_no_guess(monkeypatch):
+    """Whatever PDHG says, lanes are solved: by columns and the interior point."""
+    mdp, arrays = model("grid")
+    read = pdhg.FlowProgram.read
+
+    def spoiled(self, *arguments):
+        found = read(self, *arguments)
+        found.x[:], found.value[:], found.weights[:] = np.nan, np.nan, np.nan
+        return found
+
+    monkeypatch.setattr(pdhg.FlowProgram, "read", spoiled)
+    expectations = np.random.default_rng(1).uniform(0.0, 12.0, size=(2, 16))
+    solution = lpal(mdp, expectations, method="pdhg")
+    for lane, given in enumerate(expectations):
+        assert_solved(jax.tree.map(lambda leaf, lane=lane: leaf[lane], solution), arrays, given, 1e-3)

@@ -6,9 +6,11 @@ code never checks values. Shapes are reported as expected against actual.
 
 from __future__ import annotations
 
+import functools
 import operator
 import reprlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
@@ -16,6 +18,8 @@ import numpy as np
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
     from jaxtyping import Array, Bool, Float, Int, Num, Shaped
+
+F = TypeVar("F", bound=Callable)
 
 MAX_SLOTS = 2**31 - 2  # flat indices of the solvers are int32, and one is the padding's
 
@@ -48,6 +52,22 @@ def to_device(array: Any, dtype: DTypeLike | None = None) -> Array:
 def is_traced(*trees: Any) -> bool:
     """True if any leaf of the given pytrees is a traced value (host checks are then impossible)."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def eager_where_concrete(function: F) -> F:
+    """A door whose calls with concrete values alone run at once, under `jit` and `vmap` too, and give constants there.
+
+    Without it whatever such a function computes on the way would be traced, and its work on the host fail.
+    """
+
+    @functools.wraps(function)
+    def call(*args, **keywords):
+        if is_traced(args, keywords):
+            return function(*args, **keywords)
+        with jax.ensure_compile_time_eval():
+            return function(*args, **keywords)
+
+    return call
 
 
 def in_one_line(value: Any) -> str:

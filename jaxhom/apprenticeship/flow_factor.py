@@ -19,7 +19,7 @@ from jaxhom.solvers.block_tridiagonal import BlockCholesky, Blocks, order_in_blo
 
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
-    from jaxtyping import Float, Int
+    from jaxtyping import Array, Float, Int
 
 _REGULARISATIONS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)  # shares of the diagonal, to be tried in turn
 MAX_ENTRIES = 2**28  # of the factor: 2 GB in float64
@@ -31,6 +31,14 @@ def factor_entries(mdp: MDP) -> tuple[Blocks, int]:
     pattern = flow.toarray() @ flow.toarray().T if mdp.is_dense else flow @ flow.T
     blocks = order_in_blocks(scipy.sparse.csr_array(pattern))
     return blocks, 2 * blocks.count * blocks.size**2
+
+
+def feature_units(size: Float[np.ndarray, " K"] | Float[Array, " K"]) -> Float[np.ndarray, " K"] | Float[Array, " K"]:
+    """c [K]: one unit for features of sizes [K] that hardly differ, and for those that do one a power of 16 smaller."""
+    numpy = np if isinstance(size, np.ndarray) else jnp
+    largest = numpy.where(size.max() > 0, size.max(), 1.0)
+    smaller = numpy.floor(numpy.log2(largest / numpy.where(size > 0, size, largest)) / 4.0)
+    return largest * 16.0**-smaller
 
 
 def split_flow(mdp: MDP, unit: Float[np.ndarray, " K"], dtype: DTypeLike) -> tuple[Splitting, Int[np.ndarray, " S"]]:

@@ -54,22 +54,28 @@ class FlowFactor(Record):
       diagonal: [nb, n, n], inverses of the factor's diagonal blocks.
       behind: [S, K], (F F^T)^-1 F Phi.
       schur: [K, K], inverse of the feature rows' Schur complement.
+      order: int [2, S], the states in the order of the blocks, and its inverse; None where that is the caller's.
     """
 
     lower: Float[Array, "nb n n"]
     diagonal: Float[Array, "nb n n"]
     behind: Float[Array, "S K"]
     schur: Float[Array, "K K"]
+    order: Int[Array, "2 S"] | None = None
 
     def solve(
         self, flow: Float[Array, "S lanes"], expected: Float[Array, "K lanes"]
     ) -> tuple[Float[Array, "S lanes"], Float[Array, "K lanes"]]:
         """(y, m) with M M^T (y, m) = (flow, expected)."""
         on_features = self.schur @ (expected - self.behind.T @ flow)
-        return self._solve_flow(flow) - self.behind @ on_features, on_features
+        return self.solve_flow(flow) - self.behind @ on_features, on_features
 
-    def _solve_flow(self, right: Float[Array, "S lanes"]) -> Float[Array, "S lanes"]:
+    def solve_flow(self, right: Float[Array, "S lanes"]) -> Float[Array, "S lanes"]:
+        """(F F^T)^-1 of some columns."""
         (count, size, _), (num_states, lanes) = self.diagonal.shape, right.shape
+        if self.order is not None:
+            ordered = self.replace(order=None).solve_flow(right[self.order[0]])
+            return ordered[self.order[1]]
         if count == 1:
             return self.diagonal[0] @ right
         right = jnp.pad(right, ((0, count * size - num_states), (0, 0))).reshape(count, size, lanes)
@@ -144,7 +150,9 @@ class State(Record):
 
     Attributes:
       t: [S, A, lanes]. v: [K, lanes]. weight: [lanes], tau.
-      change: [lanes], sum |x' - x| of the last iteration: x sums to about 1, and is off the flow by no more.
+      x: [S, A, lanes], x' of the last iteration, on the flow; entries below 0 are cut off by whoever reads it.
+      value: [S, lanes], y / tau there.
+      change: [lanes], sum |x' - x| there: x sums to about 1, and is off the flow by no more.
       moved: [lanes], sum |w - former w| since the weight was looked at: 0 where w has arrived at a vertex.
       iterations: int32 [lanes].
     """
@@ -152,6 +160,8 @@ class State(Record):
     t: Float[Array, "S A lanes"]
     v: Float[Array, "K lanes"]
     weight: Float[Array, " lanes"]
+    x: Float[Array, "S A lanes"]
+    value: Float[Array, "S lanes"]
     change: Float[Array, " lanes"]
     moved: Float[Array, " lanes"]
     iterations: Int[Array, " lanes"]
@@ -180,7 +190,8 @@ def begin(splitting: Splitting, goal: Goal) -> State:
     one = jnp.ones(goal.w.shape[-1], goal.w.dtype)
     x = splitting.allowed(goal.x)
     v = splitting.expected(x) - goal.w
-    return State(t=x, v=v, weight=one, change=one, moved=one, iterations=one.astype(jnp.int32) * 0)
+    value = jnp.zeros((len(x), len(one)), x.dtype)
+    return State(t=x, v=v, weight=one, x=x, value=value, change=one, moved=one, iterations=0 * one.astype(jnp.int32))
 
 
 def point(splitting: Splitting, goal: Goal, state: State) -> Point:
@@ -195,11 +206,12 @@ def advance(splitting: Splitting, goal: Goal, state: State) -> State:
     old = point(splitting, goal, state)
 
     def iterations(k, state):
-        # All but one, then one: the last change is looked at, and an iteration is compiled once.
+        # All but one, then one: what the last one did is looked at, and an iteration is compiled once.
         before = state.t
         count = jnp.where(k == 0, STEPS_PER_WEIGHT - 1, 1)
         state = jax.lax.fori_loop(0, count, lambda _, state: _iterate(splitting, goal, state), state)
-        return state.replace(change=jnp.abs(state.t - before).sum(axis=(0, 1)) / RELAXATION)
+        moved = (state.t - before) / RELAXATION
+        return state.replace(x=jnp.maximum(before, 0.0) + moved, change=jnp.abs(moved).sum(axis=(0, 1)))
 
     state = jax.lax.fori_loop(0, 2, iterations, state)
     new = point(splitting, goal, state)
@@ -221,7 +233,7 @@ def _iterate(splitting: Splitting, goal: Goal, state: State) -> State:
     kept = jnp.maximum(state.t, 0.0) + (RELAXATION - 1.0) * jnp.maximum(-state.t, 0.0)
     t = splitting.allowed(kept - RELAXATION * jnp.stack(splitting.rows(y, m), axis=1))
     # u' - u with u' = 2 u - v + m.
-    return state.replace(t=t, v=state.v + RELAXATION * (now.u - state.v + m))
+    return state.replace(t=t, v=state.v + RELAXATION * (now.u - state.v + m), value=y / state.weight)
 
 
 def _length(first: Float[Array, "S A lanes"], second: Float[Array, "K lanes"]) -> Float[Array, " lanes"]:
@@ -231,12 +243,9 @@ def _length(first: Float[Array, "S A lanes"], second: Float[Array, "K lanes"]) -
 def reading(
     splitting: Splitting, goal: Goal, state: State
 ) -> tuple[Float[Array, "S A lanes"], Float[Array, "K lanes"], Float[Array, "S lanes"]]:
-    """What a state says: x' >= 0, which is on the flow up to what is cut off, the weights w, and values for them."""
-    now = point(splitting, goal, state)
-    y, m = splitting.multipliers(jnp.abs(state.t), 2.0 * now.u - state.v)
-    x = splitting.allowed(jnp.abs(state.t) - jnp.stack(splitting.rows(y, m), axis=1))
-    w = now.w if splitting.share is None else now.w * splitting.share[:, None]
-    return jnp.maximum(x, 0.0), w, y / state.weight
+    """What a state says: x >= 0, which is on the flow up to what is cut off, the weights w, and values for them."""
+    w = point(splitting, goal, state).w
+    return jnp.maximum(state.x, 0.0), w if splitting.share is None else w * splitting.share[:, None], state.value
 
 
 def project_weighted_simplex(

@@ -16,6 +16,7 @@ itself, `interior_point` an interior-point method on the same, and `quickest` ch
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -25,8 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.apprenticeship.arguments import check_features, checked_expectations, checked_start
 from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.columns import solve_by_columns
+from jaxhom.apprenticeship.in_program import ITERATIONS, Program, solve_in_program
 from jaxhom.apprenticeship.interior_point import solve_by_interior_point
 from jaxhom.apprenticeship.pdhg import solve_by_pdhg
 from jaxhom.apprenticeship.prepared import PreparedModel
@@ -35,11 +38,11 @@ from jaxhom.apprenticeship.quickest import solve_by_the_quickest
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.sensitivity import with_derivatives, without_tangents
 from jaxhom.apprenticeship.solution import Found, LPALMethod, LPALSolution
-from jaxhom.models.inputs import as_model, check_policy
+from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
-    from jaxtyping import ArrayLike, Float
+    from jaxtyping import Array, ArrayLike, Float
 
 METHODS: dict[str, Callable[[Request], Found]] = {
     "auto": solve_by_the_quickest,
@@ -50,7 +53,6 @@ METHODS: dict[str, Callable[[Request], Found]] = {
 
 FORMER_METHODS = {"flow": "pdhg"}
 
-_LARGEST = 2.0**-20  # share of the largest number of a type: what sums of expectations may need stays within it
 _FLOAT32_GOAL = 0.5  # share of the tolerance that methods aim for: the rest is for what the model's rounding hides
 
 __all__ = ["LPAL", "LPALMethod", "LPALSolution", "lpal"]
@@ -97,16 +99,23 @@ def lpal(
       are computed in float64 from the policy and the weights that are returned, rounding included. STALLED says that
       rounding keeps them further apart than the tolerance.
 
-    Works on the host: not under `jit` or `vmap`, for which expectations come in batches. Under `jax.grad` and
-    `jax.jvp`, `margin` and `margin_bound` have the derivative of the best margin with respect to expectations and to
-    the model's probability, initial, features and discount (`jaxhom.apprenticeship.sensitivity`); policy, occupancy
-    and weights are constants there.
+    Works under `jit`, `vmap` and `grad`, in all arrays of the model but its graph (`next_state`), in expectations and
+    starts; options are constants. Inside a program method "pdhg" runs, which is what "auto" means there, in one loop of
+    at most 1,000 iterations, with columns in between (`jaxhom.apprenticeship.in_program`); under `vmap` all lanes are
+    one batch. Its bounds are in the model's type: in float32 they are as wide as its rounding, some 1e-6 /
+    (1 - discount)^2. Close over a model and exchange its arrays by `mdp.replace(...)`: one that is an argument itself
+    has a traced graph, and may have up to 4,096 states. With concrete values alone a call inside a program runs at once
+    and is a constant.
+
+    Under `jax.grad` and `jax.jvp`, `margin` and `margin_bound` have the derivative of the best margin with respect to
+    expectations and to the model's probability, initial, features and discount
+    (`jaxhom.apprenticeship.sensitivity`); policy, occupancy and weights are constants there.
 
     Raises:
       ValueError: on wrong shapes, expectations that are not finite, an initial policy whose rows are not
         distributions or that does what is not allowed, a warm start that is none, a model without features, numbers so
-        large that their sums over time overflow, an unknown method, a model too large for method "pdhg"; under jit or
-        vmap; on second derivatives.
+        large that their sums over time overflow, an unknown method, a model too large for method "pdhg"; inside a
+        program on a traced option, or on a method that works on the host; on second derivatives.
 
     Source: Syed, Bowling and Schapire 2008; Boularias and Chaib-draa 2010, eqs. (2)-(5).
 
@@ -116,6 +125,10 @@ def lpal(
       >>> expert = jaxhom.optimal_policy(mdp, mdp.features[..., 3])
       >>> solution = jaxhom.lpal(mdp, jaxhom.feature_expectations(mdp, expert.policy), tolerance=0.01)
       >>> print(bool(solution.margin_bound - solution.margin <= 0.01))
+      True
+      >>> import jax
+      >>> found = jax.jit(lambda vhat: jaxhom.lpal(mdp, vhat, tolerance=0.01))(solution.margin + jax.numpy.ones(4))
+      >>> print(bool(found.margin_bound - found.margin <= 0.01))
       True
     """
     method = _checked_method(method)
@@ -131,7 +144,7 @@ class LPAL:
     not for several threads.
 
     Args:
-      mdp: the model, with K >= 1 features; as in `lpal`, not under `jit` or `vmap`, but under `grad`.
+      mdp: the model, with K >= 1 features; traced as in `lpal`.
 
     Raises:
       ValueError: if the model has no features, or features so large that their sums over time overflow.
@@ -149,10 +162,12 @@ class LPAL:
         self._mdp = as_model(mdp)
         if not self._mdp.num_features:
             raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
-        concrete = without_tangents(self._mdp)
-        _refuse_traced(concrete)
-        _check_features(concrete)
-        self._model = PreparedModel(concrete)
+        model = without_tangents(self._mdp)
+        if checks.is_traced(model):
+            self._model, self._program = None, Program.of_traced(model)
+        else:
+            check_features(model)
+            self._model = PreparedModel(model)
 
     def __repr__(self) -> str:
         return f"LPAL({self._mdp!r})"
@@ -170,23 +185,50 @@ class LPAL:
     ) -> LPALSolution:
         """`lpal` on the prepared model; see there for arguments, results and errors."""
         method = _checked_method(method)
-        given = expectations
-        expectations, initial_policy, warm_start = without_tangents((expectations, initial_policy, warm_start))
-        _refuse_traced(expectations, initial_policy, warm_start)
-        host = _checked_expectations(self._model.given, expectations)
-        batch = np.atleast_2d(host).astype(np.float64)
-        policy, weights = _checked_start(self._model.given, batch, initial_policy, warm_start)
         if max_iterations is not None:
             max_iterations = checks.require_count("max_iterations", max_iterations)
-        request = _presolved(self._model, batch, tolerance)
-        request = request.replace(policy=policy, weights=weights, limit=max_iterations, progress=progress)
-        solution = request.certified(METHODS[method](request))
+        if tolerance is not None:
+            checks.refuse_traced(tolerance=tolerance)
+            checks.require_positive("tolerance", tolerance)
+        given = expectations
+        expectations, policy, warm_start = without_tangents((expectations, initial_policy, warm_start))
+        expectations = checked_expectations(self._mdp, expectations)
+        batch = expectations if expectations.ndim == 2 else expectations[None]
+        is_inside = self._model is None or checks.is_traced(expectations, policy, warm_start)
+        if is_inside:
+            solution = self._solve_in_program(batch, policy, warm_start, tolerance, method, max_iterations)
+        else:
+            with jax.ensure_compile_time_eval():  # inside a program this is a constant
+                solution = self._solve_on_host(batch, policy, warm_start, tolerance, method, max_iterations, progress)
         if checks.is_traced(self._mdp, given):
-            given = jnp.atleast_2d(jnp.asarray(given, self._mdp.dtype))
+            given = jnp.asarray(given, self._mdp.dtype).reshape(batch.shape)
             solution = with_derivatives(jax.tree.map(checks.to_device, solution), self._mdp, given)
-        if host.ndim == 1:
+        if expectations.ndim == 1:
             solution = jax.tree.map(lambda leaf: leaf[0], solution)
-        return jax.device_put(solution)
+        return jax.tree.map(checks.to_device, solution)
+
+    def _solve_on_host(
+        self, batch: Float[np.ndarray, "B K"], policy, warm_start, tolerance, method: str, limit: int | None, progress
+    ) -> LPALSolution:
+        policy, weights = checked_start(self._model.given, batch.shape, policy, warm_start)
+        request = _presolved(self._model, batch.astype(np.float64), tolerance)
+        request = request.replace(policy=policy, weights=weights, limit=limit, progress=progress)
+        return request.certified(METHODS[method](request))
+
+    def _solve_in_program(
+        self, batch: Float[Array, "B K"], policy, warm_start, tolerance, method: str, limit: int | None
+    ) -> LPALSolution:
+        if method not in ("auto", "pdhg"):
+            raise ValueError(f"method={method!r} works on the host: inside jit and vmap lpal is by method='pdhg'")
+        policy, weights = checked_start(self._mdp, batch.shape, policy, warm_start)
+        start = {"policy": policy, "weights": weights}
+        limit = ITERATIONS if limit is None else limit
+        return solve_in_program(self._program, jnp.asarray(batch), tolerance=tolerance, max_iterations=limit, **start)
+
+    @functools.cached_property
+    def _program(self) -> Program:
+        with jax.ensure_compile_time_eval():
+            return Program.of_concrete(self._model)
 
 
 def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tolerance) -> Request:
@@ -194,8 +236,6 @@ def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tol
     reduction = reduce_expectations(model.reach, expectations)
     if tolerance is None:
         tolerance = default_tolerance(model.reach, reduction)
-    else:
-        checks.require_positive("tolerance", tolerance)
     tolerance = np.broadcast_to(np.asarray(tolerance, np.float64), len(expectations))
     share = 1.0 if model.given.dtype == jnp.float64 else _FLOAT32_GOAL
     return Request(
@@ -207,9 +247,6 @@ def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tol
     )
 
 
-# ------------------------------------------------------------------------------------------------------------- checks
-
-
 def _checked_method(method: str) -> str:
     """A method of the table; under its former name with a warning."""
     if isinstance(method, str) and method in FORMER_METHODS:
@@ -218,55 +255,3 @@ def _checked_method(method: str) -> str:
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method must be one of {tuple(METHODS)}, got {method!r}")
     return method
-
-
-def _refuse_traced(*trees) -> None:
-    if checks.is_traced(*trees):
-        raise ValueError("lpal adds columns on the host: call it outside jit and vmap, in batches [B, K]")
-
-
-def _check_features(mdp: MDP) -> None:
-    """Small enough for sums over time in the model's type."""
-    features, largest = np.asarray(mdp.features), _largest(mdp) * (1.0 - float(mdp.discount))
-    if max(features.max(), -features.min()) > largest:
-        message = f"is too large for sums over time in {mdp.dtype} at this discount"
-        checks.require_all("features", features, np.abs(features) <= largest, message)
-
-
-def _checked_expectations(mdp: MDP, expectations) -> Float[np.ndarray, "*B K"]:
-    """Expectations [K] or [B, K], small enough for margins in the model's type."""
-    host = checks.as_host_array("expectations", expectations)
-    good = host.ndim in (1, 2) and host.shape[-1] == mdp.num_features and host.size > 0
-    checks.require_shape("expectations", host, f"({mdp.num_features},) or (B, {mdp.num_features})", good)
-    host = checks.require_floats("expectations", host)
-    checks.require_all("expectations", host, np.abs(host) <= _largest(mdp), f"is too large for margins in {mdp.dtype}")
-    return host
-
-
-def _largest(mdp: MDP) -> float:
-    return _LARGEST * float(np.finfo(mdp.dtype).max)
-
-
-def _checked_start(mdp: MDP, batch: Float[np.ndarray, "B K"], initial_policy, warm_start):
-    """Policies [B, S, A] and weights [B, K] to begin with, or None."""
-    weights = None
-    if warm_start is not None:
-        if not isinstance(warm_start, LPALSolution):
-            raise ValueError(f"warm_start must be an LPALSolution, got {type(warm_start).__name__}")
-        initial_policy = warm_start.policy if initial_policy is None else initial_policy
-        weights = _for_each_lane("warm_start.weights", warm_start.weights, batch)
-    if initial_policy is not None:
-        policy = check_policy(mdp, initial_policy, "initial_policy")
-        initial_policy = _for_each_lane("initial_policy", policy, batch)
-    return initial_policy, weights
-
-
-def _for_each_lane(name: str, guess, batch: Float[np.ndarray, "B K"]) -> np.ndarray:
-    """Distributions [..., n], one for all lanes of the batch or one for each, as [B, ..., n]."""
-    guess = checks.as_host_array(name, guess)
-    lane_ndim = 1 if name.endswith("weights") else 2
-    lane_shape = batch.shape[1:] if lane_ndim == 1 else guess.shape[-2:]
-    good = guess.shape[-lane_ndim:] == lane_shape and guess.shape[:-lane_ndim] in ((), (len(batch),))
-    checks.require_shape(name, guess, f"({len(batch)}, {'K' if lane_ndim == 1 else 'S, A'})", good)
-    guess = checks.require_distribution(name, guess)
-    return np.broadcast_to(guess, (len(batch), *lane_shape))

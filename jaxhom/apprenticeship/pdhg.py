@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxhom.apprenticeship.certificate import simplex_point
 from jaxhom.apprenticeship.columns import DEFAULT_COLUMNS, Columns, solve_by_columns
-from jaxhom.apprenticeship.flow_factor import split_flow
+from jaxhom.apprenticeship.flow_factor import feature_units, split_flow
 from jaxhom.apprenticeship.flow_splitting import STEPS_PER_WEIGHT, Goal, Splitting, State, advance, begin, reading
 from jaxhom.apprenticeship.interior_point import is_banded, solve_by_interior_point
 from jaxhom.apprenticeship.request import Request
@@ -104,14 +104,21 @@ def _looks(limit: int) -> list[int]:
 
 
 class FlowProgram:
-    """The program of a model, for any expectations: features in units of their own, and the factor for them."""
+    """The program of a model, for any expectations: features in units of their own, and the factor for them.
+
+    Attributes:
+      dtype: of the iterations.
+      unit: [K], that of each feature, in the model's.
+      splitting: the program. order: int [S], in which it has the states.
+      workers: programs to have under way at a time.
+    """
 
     def __init__(self, mdp: MDP, dtype: DTypeLike | None = None):
         short = np.float32 if float(mdp.discount) <= _SHORT_DISCOUNT else mdp.dtype
         self.dtype = np.dtype(short if dtype is None else dtype)
-        self._unit = _units(np.abs(np.asarray(mdp.features, np.float64)).max(axis=(0, 1)))
-        self.splitting, order = split_flow(mdp, self._unit, self.dtype)
-        self._mdp, self._order, self._place = mdp, order, np.argsort(order)
+        self.unit = feature_units(np.abs(np.asarray(mdp.features, np.float64)).max(axis=(0, 1)))
+        self.splitting, self.order = split_flow(mdp, self.unit, self.dtype)
+        self._mdp, self._place = mdp, np.argsort(self.order)
         self._kept = 1.0 - float(mdp.discount)
         self.workers = 1 if self.splitting.factor.diagonal.size > _STREAMED else num_cores()
 
@@ -129,9 +136,9 @@ class FlowProgram:
             x = self._kept * np.asarray(occupancy(self._mdp, jnp.asarray(policy, self._mdp.dtype)))
         weights = np.full(expectations.shape, 1.0 / expectations.shape[1]) if weights is None else weights
         parts = {
-            "expectations": (self._kept * expectations / self._unit).T,
-            "x": np.moveaxis(np.nan_to_num(x[:, self._order]), 0, -1),
-            "w": (simplex_point(weights) * self._unit / self._unit.min()).T,
+            "expectations": (self._kept * expectations / self.unit).T,
+            "x": np.moveaxis(np.nan_to_num(x[:, self.order]), 0, -1),
+            "w": (simplex_point(weights) * self.unit / self.unit.min()).T,
         }
         return Goal(**{name: np.ascontiguousarray(part, self.dtype) for name, part in parts.items()})
 
@@ -150,7 +157,7 @@ class FlowProgram:
         return Found(
             x=np.moveaxis(x, -1, 0)[:, self._place] / self._kept,
             weights=simplex_point(w.T),
-            value=value.T[:, self._place] * self._unit.min(),
+            value=value.T[:, self._place] * self.unit.min(),
             iterations=state.iterations,
             stopped=np.full(total, Status.ITERATION_LIMIT),
             decided_by=np.full(total, LPALMethod.PDHG),
@@ -178,11 +185,3 @@ def _advance(splitting: Splitting, goal: Goal, state: State | None, count) -> St
 
 
 _reading = jax.jit(reading)
-
-
-def _units(size: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
-    """c [K]: one unit for features of sizes [K] that hardly differ, and for those that do one a power of 16 smaller."""
-    largest = size.max() or 1.0
-    with np.errstate(divide="ignore"):
-        smaller = np.floor(np.log2(largest / np.where(size > 0, size, largest)) / 4.0)
-    return largest * 16.0**-smaller

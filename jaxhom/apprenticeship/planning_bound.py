@@ -12,11 +12,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxhom.models.mdp import MDP
-from jaxhom.planning.optimal import Plan, optimal_policy
+from jaxhom.planning.plan import Plan
+from jaxhom.planning.plan_program import plan_in_program
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
+
+_MAX_ITERATIONS = 100_000  # sweeps
 
 
 class UpperBound(Record):
@@ -33,6 +36,8 @@ def bound_by_planning(
     weights: Float[Array, "B K"],
     value: Float[Array, "B S"],
     tolerance: Float[Array, "*B"],
+    *,
+    is_quick: bool = False,
 ) -> tuple[UpperBound, Plan]:
     """The bound of weights [B, K]: the value of planning for them, its own error added.
 
@@ -42,6 +47,7 @@ def bound_by_planning(
       weights: [B, K], in the simplex.
       value: [B, S], a start for planning.
       tolerance: gap that the caller is after; planning is a tenth as loose.
+      is_quick: by sweeps alone, where they get on: the bound is looser where they do not.
     """
     # In float32 a projection can leave a sum that is off by 1e-4, and the bound with it; or nothing at all.
     total = weights.sum(axis=-1, keepdims=True)
@@ -49,12 +55,15 @@ def bound_by_planning(
     reward = jnp.einsum("sak,bk->bsa", mdp.features, weights)
     reward = jnp.broadcast_to(reward, (len(weights), mdp.num_states, mdp.num_actions))
     residual = 0.1 * tolerance * (1.0 - mdp.discount)
-    plan = optimal_policy(mdp, reward, initial_value=value, tolerance=residual)
+    if mdp.restricts_actions:
+        reward = jnp.where(mdp.allowed, reward, -jnp.inf)
+    arrays = (jnp.moveaxis(reward, 0, -1), value.T, jnp.broadcast_to(residual, len(weights)))
+    plan = plan_in_program(mdp, *arrays, max_iterations=_MAX_ITERATIONS, is_quick=is_quick)[0]
     best, target = plan.upper_bound(mdp) @ mdp.initial, weights * expectations
     bound = best - target.sum(axis=-1)
     # Values are sums of 1 / (1 - gamma) rewards; the sums over K, that of the weights among them, have K terms.
     terms = mdp.num_features + 8.0
-    size = 8.0 * jnp.abs(reward).max(axis=(1, 2)) / (1.0 - mdp.discount)
+    size = 8.0 * jnp.where(mdp.allowed, jnp.abs(reward), 0.0).max(axis=(1, 2)) / (1.0 - mdp.discount)
     size += terms * (jnp.abs(target).sum(axis=-1) + jnp.abs(bound))
     bound += jnp.finfo(mdp.dtype).eps * size
     return UpperBound(margin_bound=bound, weights=weights, policy=plan.policy), plan

@@ -11,27 +11,35 @@ then within max_i high_i - low_i of some [low_i, high_i]: methods lose no digits
 they are.
 
 The same numbers say how small a gap is: small against what each of the features that may be the smallest can do.
+
+In NumPy where everything is concrete, and in JAX inside a program.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.apprenticeship.exact import compact_features
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from types import ModuleType
+
+    from jaxtyping import Array, Bool, Float, Int
+
+    Host = np.ndarray | Array
 
 _GAP = 1e-5  # share of what a feature can do: a policy that loses so little is as good
 _SAME = 4.0  # roundings of a feature's size within which two of its values are the same
 
 
 class Reduction(Record):
-    """What was changed, per lane; NumPy, float64.
+    """What was changed, per lane.
 
     Attributes:
       expectations: [B, K], to solve for in place of the given ones.
@@ -42,27 +50,27 @@ class Reduction(Record):
         anything.
     """
 
-    expectations: Float[np.ndarray, "B K"]
-    shift: Float[np.ndarray, " B"]
-    is_idle: Bool[np.ndarray, "B K"]
-    scarcest: Int[np.ndarray, " B"]
-    least: Float[np.ndarray, " B"]
+    expectations: Float[Host, "B K"]
+    shift: Float[Host, " B"]
+    is_idle: Bool[Host, "B K"]
+    scarcest: Int[Host, " B"]
+    least: Float[Host, " B"]
 
-    def weights(self, lanes: Int[np.ndarray, " C"], weights: Float[np.ndarray, "C K"]) -> Float[np.ndarray, "C K"]:
+    def weights(self, lanes: Int[np.ndarray, " C"] | slice, weights: Float[Host, "C K"]) -> Float[Host, "C K"]:
         """Weights for the given expectations of some lanes from those for the reduced ones.
 
         Weight on an idle feature goes to the scarcest one, which is smaller for every policy: the bound that it proves
         can only get better.
         """
-        idle, to = self.is_idle[lanes], self.scarcest[lanes][:, None]
-        kept = np.where(idle, 0.0, weights)
-        np.put_along_axis(kept, to, 0.0, axis=1)
-        np.put_along_axis(kept, to, np.maximum(0.0, 1.0 - kept.sum(axis=1, keepdims=True)), axis=1)
-        return np.where(idle.any(axis=1, keepdims=True), kept, weights)
+        numpy, idle = _numpy_of(weights), self.is_idle[lanes]
+        is_scarcest = numpy.arange(weights.shape[1]) == self.scarcest[lanes][:, None]
+        kept = numpy.where(idle | is_scarcest, 0.0, weights)
+        rest = numpy.maximum(0.0, 1.0 - kept.sum(axis=1, keepdims=True))
+        return numpy.where(idle.any(axis=1, keepdims=True), numpy.where(is_scarcest, rest, kept), weights)
 
 
 class Reach(Record):
-    """What the features of policies can be, and do; NumPy, float64.
+    """What the features of policies can be, and do.
 
     Attributes:
       low, high: [K], the least and the largest discounted sum of each feature, whatever the policy; with the sums of
@@ -72,41 +80,48 @@ class Reach(Record):
       discount: scalar.
     """
 
-    low: Float[np.ndarray, " K"]
-    high: Float[np.ndarray, " K"]
-    scale: Float[np.ndarray, " K"]
-    size: float
-    discount: float
+    low: Float[Host, " K"]
+    high: Float[Host, " K"]
+    scale: Float[Host, " K"]
+    size: float | Float[Array, ""]
+    discount: float | Float[Array, ""]
 
     @classmethod
     def of(cls, mdp: MDP) -> Reach:
-        """That of a concrete model."""
-        values = _values(mdp)
-        low, high = _sums(mdp, values)
-        same = _SAME * float(np.finfo(mdp.dtype).eps)
-        size, discount = float(np.abs(values).max()) or 1.0, float(mdp.discount)
-        return cls(low=low, high=high, scale=_scales(values, same), size=size, discount=discount)
+        """That of a model: in float64 if it is concrete, inside a program in the model's type."""
+        numpy = jnp if checks.is_traced(mdp) else np
+        values, exists = _values(mdp)
+        bottom, top = _extremes(values, exists)
+        times = _times(mdp)
+        size = numpy.abs(values).max()
+        return cls(
+            low=(bottom * times).min(axis=0),
+            high=(top * times).max(axis=0),
+            scale=_scales(values, exists, _SAME * float(jnp.finfo(mdp.dtype).eps)),
+            size=numpy.where(size > 0, size, 1.0),
+            discount=mdp.discount if numpy is jnp else float(mdp.discount),
+        )
 
 
-def reduce_expectations(reach: Reach, expectations: Float[np.ndarray, "B K"]) -> Reduction:
-    """Reduces expectations, on the host."""
-    low, high = reach.low, reach.high
+def reduce_expectations(reach: Reach, expectations: Float[Host, "B K"]) -> Reduction:
+    """Reduces expectations."""
+    numpy, low, high = _numpy_of(expectations), reach.low, reach.high
     most = (high - expectations).min(axis=1)
     least = (low - expectations).min(axis=1)
     floor = low - most[:, None]
-    shift = np.clip(0.0, least, most)
+    shift = numpy.clip(0.0, least, most)
     is_idle = expectations < floor
-    scale = np.where(is_idle, np.inf, reach.scale).min(axis=1)
+    scale = numpy.where(is_idle, numpy.inf, reach.scale).min(axis=1)
     return Reduction(
-        expectations=np.maximum(expectations, floor) + shift[:, None],
+        expectations=numpy.maximum(expectations, floor) + shift[:, None],
         shift=shift,
         is_idle=is_idle,
         scarcest=(high - expectations).argmin(axis=1),
-        least=np.where(np.isfinite(scale), scale, reach.size),
+        least=numpy.where(numpy.isfinite(scale), scale, reach.size),
     )
 
 
-def default_tolerance(reach: Reach, reduction: Reduction) -> Float[np.ndarray, " B"]:
+def default_tolerance(reach: Reach, reduction: Reduction) -> Float[Host, " B"]:
     """A gap that is small against the least that a feature can do which may be the smallest of its lane.
 
     Where features of two scales bind together, the margin is decided in the units of the smaller one. Constant features
@@ -115,37 +130,59 @@ def default_tolerance(reach: Reach, reduction: Reduction) -> Float[np.ndarray, "
     return _GAP / (1.0 - reach.discount) * reduction.least
 
 
-def _scales(values: np.ndarray, same: float) -> np.ndarray:
-    """What each feature can do per step, from its values [N, K]; infinite where it is constant.
+def _numpy_of(array: Host) -> ModuleType:
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def _scales(values: Float[Host, "N K"], exists: Bool[Host, "N 1"], same: float) -> Float[Host, " K"]:
+    """What each feature can do per step; infinite where it is constant.
 
     Its range; but at most twice the distance from its largest value to the median of the others: a few pairs that are
     very bad (a cliff), which good policies avoid, are not what gaps are measured by.
     """
-    low, high = values.min(axis=0), values.max(axis=0)
+    numpy, (low, high) = _numpy_of(values), _extremes(values, exists)
     scale = high - low
-    same = same * np.maximum(abs(low), abs(high))
+    same = same * numpy.maximum(abs(low), abs(high))
     is_constant = scale <= same
-    is_below = values < high - same
+    is_below = exists & (values < high - same)
     many_high = (is_below & (values > high - 0.5 * scale)).sum(axis=0) >= 0.5 * is_below.sum(axis=0)
-    for k in np.flatnonzero(many_high & ~is_constant):
-        others = np.sort(values[is_below[:, k], k])
-        scale[k] = min(scale[k], 2.0 * (high[k] - others[len(others) // 2]))
-    return np.where(is_constant, np.inf, scale)
+    has_cliff = many_high & ~is_constant
+    # On the host only what is needed is sorted: millions of pairs and hundreds of features may not be.
+    some = np.flatnonzero(has_cliff) if numpy is np else np.arange(values.shape[1])
+    others = numpy.sort(numpy.where(is_below[:, some], values[:, some], numpy.inf), axis=0)
+    middle = numpy.take_along_axis(others, is_below[:, some].sum(axis=0)[None] // 2, axis=0)[0]
+    without_cliff = numpy.minimum(scale[some], 2.0 * (high[some] - middle))
+    if numpy is np:
+        scale[some] = without_cliff
+    else:
+        scale = jnp.where(has_cliff, without_cliff, scale)
+    return numpy.where(is_constant, numpy.inf, scale)
 
 
-def _values(mdp: MDP) -> np.ndarray:
-    """The features of all pairs that are allowed, [N, K], float64."""
+def _extremes(values: Float[Host, "N K"], exists: Bool[Host, "N 1"]) -> tuple[Float[Host, " K"], Float[Host, " K"]]:
+    """The least and the largest value of each feature."""
+    return values.min(axis=0, where=exists, initial=np.inf), values.max(axis=0, where=exists, initial=-np.inf)
+
+
+def _values(mdp: MDP) -> tuple[Float[Host, "N K"], Bool[Host, "N 1"]]:
+    """The features of all pairs, and which pairs are allowed."""
+    if checks.is_traced(mdp):
+        return mdp.features.reshape(-1, mdp.num_features), mdp.allowed.reshape(-1, 1)
     allowed = np.asarray(mdp.allowed)
     features = compact_features(np.asarray(mdp.features), allowed).astype(np.float64)
-    if mdp.restricts_actions and features.shape[1] > 1:
-        return features[allowed]
-    return features.reshape(-1, features.shape[-1])
+    exists = allowed if features.shape[1] > 1 else np.ones((len(features), 1), bool)
+    return features.reshape(-1, features.shape[-1]), exists.reshape(-1, 1)
 
 
-def _sums(mdp: MDP, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest discounted sums, low [K] and high [K], over what rounding leaves open."""
-    total = np.asarray(mdp.probability).sum(axis=-1, dtype=np.float64)[np.asarray(mdp.allowed)]
-    kept = float(mdp.discount) * np.array([[min(total.min(), 1.0)], [max(total.max(), 1.0)]])
-    mass = np.asarray(mdp.initial).sum(dtype=np.float64)
-    times = mass / (1.0 - kept)
-    return (values.min(axis=0) * times).min(axis=0), (values.max(axis=0) * times).max(axis=0)
+def _times(mdp: MDP) -> Float[Host, "2 1"]:
+    """Discounted times [N, 1], over what rounding leaves open."""
+    numpy = jnp if checks.is_traced(mdp) else np
+    if numpy is jnp:
+        total, initial, discount = mdp.probability.sum(axis=-1), mdp.initial.sum(), mdp.discount
+        least = jnp.where(mdp.allowed, total, 1.0).min()
+    else:
+        total = np.asarray(mdp.probability).sum(axis=-1, dtype=np.float64)[np.asarray(mdp.allowed)]
+        least, discount = total.min(), float(mdp.discount)
+        initial = np.asarray(mdp.initial).sum(dtype=np.float64)
+    kept = discount * numpy.stack([numpy.minimum(least, 1.0), numpy.maximum(total.max(), 1.0)])
+    return (initial / (1.0 - kept))[:, None]

@@ -49,7 +49,7 @@ def respond(
       features [L, K] of these actions.
     """
     bound, plan = bound_by_planning(mdp, expectations, weights, value, accuracy)
-    mu, expected = _expected_features(mdp, plan.policy, jnp.where(jnp.isfinite(accuracy), error, jnp.inf))
+    mu, expected = expected_features(mdp, plan.policy, jnp.where(jnp.isfinite(accuracy), error, jnp.inf))
     return {
         "weights": bound.weights,
         "margin_bound": bound.margin_bound,
@@ -65,15 +65,20 @@ def evaluate(
     mdp: MDP, policy: Float[Array, "L S A"], error: Float[Array, ""]
 ) -> tuple[Float[Array, "L S"], Float[Array, "L K"]]:
     """State occupancies and feature expectations of policies, these up to an error."""
-    mu, expected = _expected_features(mdp, policy, error)
+    mu, expected = expected_features(mdp, policy, error)
     return mu.T, expected
 
 
-def _expected_features(mdp, policy, error):
-    """State occupancies [S, L] and feature expectations [L, K] of policies [L, S, A], up to `error` [L]."""
+def expected_features(
+    mdp: MDP, policy: Float[Array, "L S A"], error: Float[Array, "*L"], *, is_quick: bool = False
+) -> tuple[Float[Array, "S L"], Float[Array, "L K"]]:
+    """State occupancies and feature expectations of policies, these up to `error`; for use under `jit`.
+
+    `is_quick`: by iterations alone; NaN where they take long.
+    """
     largest = jnp.abs(mdp.features).max()
     residual = error * (1.0 - mdp.discount) / (jnp.sqrt(mdp.num_states) * jnp.where(largest > 0, largest, 1.0))
-    mu = rough_state_occupancy(mdp, jnp.moveaxis(policy, 0, -1), residual)
+    mu = rough_state_occupancy(mdp, jnp.moveaxis(policy, 0, -1), residual, is_quick=is_quick)
     if mdp.features.shape[1] == 1:
         return mu, mu.T @ mdp.features[:, 0]
     return mu, jnp.einsum("sl,lsa,sak->lk", mu, policy, mdp.features)

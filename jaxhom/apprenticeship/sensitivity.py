@@ -58,23 +58,23 @@ def with_derivatives(solution: LPALSolution, mdp: MDP, expectations: Float[Array
     Returns:
       The solution; margin and margin_bound [B] both have the derivative of the best margin.
     """
-    model = without_tangents(mdp)
-    reward = jnp.einsum("sak,bk->bsa", model.features, solution.weights)
-    saddle = (solution.occupancy, solution.weights, optimal_policy(model, reward).value)
-    margin, margin_bound = _margins(mdp, expectations, solution.margin, solution.margin_bound, saddle)
+    constants = (solution.occupancy, solution.weights)
+    margin, margin_bound = _margins(mdp, expectations, solution.margin, solution.margin_bound, constants)
     return solution.replace(margin=margin, margin_bound=margin_bound)
 
 
 @jax.custom_jvp
-def _margins(mdp, expectations, margin, margin_bound, saddle):
-    del mdp, expectations, saddle
+def _margins(mdp, expectations, margin, margin_bound, constants):
+    del mdp, expectations, constants
     return margin, margin_bound
 
 
 @_margins.defjvp
 def _(primals, tangents):
-    mdp, expectations, *_, saddle = primals
+    mdp, expectations, *_, (occupancy, weights) = primals
     message = "lpal's margin has first derivatives only: the policy and the weights carry none"
+    reward = jnp.einsum("sak,bk->bsa", mdp.features, weights)
+    saddle = (occupancy, weights, optimal_policy(without_tangents(mdp), without_tangents(reward)).value)
     saddle = first_order_only(saddle, (mdp, expectations), message)
     change = jax.jvp(lambda *inputs: _lagrangian(*inputs, *saddle), primals[:2], tangents[:2])[1]
     return _margins(*primals), (change, change)

@@ -67,6 +67,15 @@ class DenseTensor(Dynamics):
         """All slots: every state may become a successor."""
         return np.broadcast_to(True, self.probability.shape)
 
+    @property
+    def longest_sum(self) -> int:
+        """All pairs."""
+        return self.probability.shape[0] * self.probability.shape[1]
+
+    def known_slots(self) -> Bool[np.ndarray, "S A S"]:
+        """All slots, as `open_slots`."""
+        return self.open_slots()
+
 
 class DenseChain(Record):
     """P_pi of one policy as a matrix [S, S]."""

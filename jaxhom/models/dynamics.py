@@ -89,3 +89,12 @@ class Dynamics(Record):
     def open_slots(self) -> Bool[np.ndarray, "S A N"]:
         """Where new probabilities may stand: in every slot whose successor the layout knows; on the host."""
         raise NotImplementedError
+
+    @property
+    def longest_sum(self) -> int:
+        """How many terms `push_forward` adds up at most, one after the other."""
+        raise NotImplementedError
+
+    def known_slots(self) -> Bool[np.ndarray, "S A N"] | None:
+        """The slots that hold a successor, on the host, also where probabilities are traced; None if the graph is."""
+        raise NotImplementedError

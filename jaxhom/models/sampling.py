@@ -13,6 +13,8 @@ from jaxhom.models.mdp import MDP
 if TYPE_CHECKING:
     from jaxtyping import Array, Bool, Float, Int, Key
 
+_SHORT = 1024  # entries of a row
+
 
 @functools.partial(jax.jit, static_argnums=(4, 5))
 def sample_walks(
@@ -55,4 +57,6 @@ def _inverse_cdf(cumulative: Float[Array, " N"], uniform: Float[Array, ""]) -> I
     """
     total = cumulative[-1]
     target = jnp.minimum(uniform * total, jnp.nextafter(total, jnp.zeros_like(total)))
-    return jnp.searchsorted(cumulative, target, side="right").astype(jnp.int32)
+    # Short rows are looked through: a search would be a loop, which takes XLA longer to compile than it saves.
+    method = "compare_all" if len(cumulative) <= _SHORT else "scan"
+    return jnp.searchsorted(cumulative, target, side="right", method=method).astype(jnp.int32)

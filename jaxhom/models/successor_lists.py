@@ -153,6 +153,20 @@ class SuccessorLists(Dynamics):
         """The slots that hold a successor: others are not searched for again."""
         return np.asarray(self.probability) > 0
 
+    @property
+    def longest_sum(self) -> int:
+        """A narrow row of predecessors, and all pieces of wide ones."""
+        return self.predecessors.narrow.shape[1] + sum(self.predecessors.wide.shape)
+
+    def known_slots(self) -> Bool[np.ndarray, "S A N"] | None:
+        """The slots that lead somewhere by the lists of predecessors, which do not change with the probabilities."""
+        if checks.is_traced(self.next_state, self.predecessors):
+            return None
+        lists = (np.asarray(self.predecessors.narrow).ravel(), np.asarray(self.predecessors.wide).ravel())
+        known = np.zeros(self.probability.size + 1, bool)  # the last one is the padding's
+        known[np.concatenate(lists)] = True
+        return known[:-1].reshape(self.probability.shape)
+
     def _narrow_rows(self, value) -> tuple[Int[Array, "S A W"], Float[Array, "S A W"], Float[Array, "S+J *B"]]:
         """Indices and weights, and the values that they read: E[value(s') | s, a] is their `gather_sum`."""
         width, (num_states, _, slots) = self.narrow_width, self.next_state.shape

@@ -66,7 +66,7 @@ def solve_chain(
         product, transposed = (forward, backward) if transpose else (backward, forward)
 
         def solver(product, transpose):
-            return lambda _, b: _solve(mdp, policy, product, b, transpose, is_quick)
+            return lambda _, b: _solve(mdp, policy, product, b, transpose, is_quick, by_lu=is_solved_by_lu(mdp))
 
         return jax.lax.custom_linear_solve(
             lambda x: x - mdp.discount * product(x),
@@ -78,7 +78,9 @@ def solve_chain(
     return solve(policy, source) if is_solved_by_lu(mdp) else _some_lanes_at_a_time(solve, policy, source)
 
 
-def rough_state_occupancy(mdp: MDP, policy: Float[Array, "S A B"], residual: Float[Array, "*B"]) -> Float[Array, "S B"]:
+def rough_state_occupancy(
+    mdp: MDP, policy: Float[Array, "S A B"], residual: Float[Array, "*B"], *, is_quick: bool = False
+) -> Float[Array, "S B"]:
     """State occupancies mu [S, B] of policies [S, A, B], up to a residual of the flow: for inner loops, under `jit`.
 
     Args:
@@ -86,13 +88,14 @@ def rough_state_occupancy(mdp: MDP, policy: Float[Array, "S A B"], residual: Flo
       policy: [S, A, B], rows sum to 1.
       residual: scalar or [B], the 2-norm of (I - gamma P_pi)^T mu - alpha that is small enough. Expectations of a
         feature within [-1, 1] are then off by at most sqrt(S) residual / (1 - gamma).
+      is_quick: by iterations alone, and give up early.
 
     Returns:
       mu [S, B]; NaN on lanes that missed the residual. Not to be differentiated.
     """
     initial = jnp.broadcast_to(mdp.initial[:, None], (mdp.num_states, policy.shape[2]))
     forward = mdp.dynamics.chain(policy).push_forward
-    return _solve(mdp, policy, forward, initial, True, residual=residual)
+    return _solve(mdp, policy, forward, initial, True, is_quick, residual, by_lu=is_solved_by_lu(mdp) and not is_quick)
 
 
 def is_solved_by_lu(mdp: MDP) -> bool:
@@ -124,10 +127,10 @@ def _some_lanes_at_a_time(
 
 
 def _solve(
-    mdp: MDP, policy, product: Callable, b, transpose: bool, is_quick=False, residual=0.0
+    mdp: MDP, policy, product: Callable, b, transpose: bool, is_quick: bool, residual=0.0, *, by_lu: bool
 ) -> Float[Array, "S *B"]:
     """Solves x = b + discount * product(x), product being that of the policy's chain or of its transpose."""
-    if is_solved_by_lu(mdp):
+    if by_lu:
         x = _solve_by_lu(mdp, policy, b, transpose)
     else:
         steps = _QUICK_STEPS if is_quick else _MAX_KRYLOV_STEPS

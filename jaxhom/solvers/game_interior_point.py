@@ -89,32 +89,38 @@ def solve_game(
     start = (0.0, 0.0) if start is None else start
     w, q = (jnp.broadcast_to(jnp.asarray(s, payoff.dtype), n) for s, n in zip(start, payoff.shape, strict=True))
     if num_rows <= num_columns:
-        w, q, steps = _iterate(payoff, is_row, is_column, (w, q), is_enough)
+        (w, q), (lower, upper), steps = _iterate(payoff, is_row, is_column, (w, q), is_enough)
     else:  # the same game with the players' parts exchanged
-        q, w, steps = _iterate(-payoff.T, is_column, is_row, (q, w), lambda lower, upper: is_enough(-upper, -lower))
-    lower, upper = _bounds(payoff, is_row, is_column, w, q)
+        (q, w), (lower, upper), steps = _iterate(
+            -payoff.T, is_column, is_row, (q, w), lambda lower, upper: is_enough(-upper, -lower)
+        )
+        lower, upper = -upper, -lower
     return GameSolution(w=w, q=q, lower=lower * scale, upper=upper * scale, steps=steps)
 
 
 def _iterate(payoff, is_row, is_column, former, is_enough):
-    """Strategies w and q that are good enough, or as good as rounding allows."""
+    """Strategies w and q that are good enough, or as good as rounding allows, and their bounds."""
 
     def keep_going(carry):
-        _, (best_w, best_q), moves, steps = carry
-        return ~is_enough(*_bounds(payoff, is_row, is_column, best_w, best_q)) & moves & (steps < _MAX_STEPS)
+        _, _, bounds, moves, steps = carry
+        return ~is_enough(*bounds) & moves & (steps < _MAX_STEPS)
 
     def advance(carry):
-        point, best, _, steps = carry
+        point, best, best_bounds, _, steps = carry
         point, is_finite = _step(payoff, is_row, is_column, point)
-        best_gap, gap = (_gap(_bounds(payoff, is_row, is_column, *pair)) for pair in (best, _strategies(point)))
-        better = is_finite & (gap < best_gap)
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), _strategies(point), best)
-        return point, best, is_finite & (gap < 2.0 * best_gap), steps + 1
+        strategies = _strategies(point)
+        bounds = _bounds(payoff, is_row, is_column, *strategies)
+        better = is_finite & (_gap(bounds) < _gap(best_bounds))
+        best, new_bounds = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), (strategies, bounds), (best, best_bounds)
+        )
+        return point, best, new_bounds, is_finite & (_gap(bounds) < 2.0 * _gap(best_bounds)), steps + 1
 
     point = _start(payoff, is_row, is_column, former)
-    start = (point, _strategies(point), jnp.array(True), jnp.zeros((), jnp.int32))
-    _, best, _, steps = jax.lax.while_loop(keep_going, advance, start)
-    return *best, steps
+    best = _strategies(point)
+    start = (point, best, _bounds(payoff, is_row, is_column, *best), jnp.array(True), jnp.zeros((), jnp.int32))
+    _, best, bounds, _, steps = jax.lax.while_loop(keep_going, advance, start)
+    return best, bounds, steps
 
 
 def _start(payoff, is_row, is_column, former):
@@ -179,11 +185,18 @@ def _step(payoff, is_row, is_column, point):
         return dw, dq, jnp.where(is_row, payoff @ dq - dv, 0.0), dd, dv, dt
 
     mu = (w @ s + q @ d) / count
-    dw, dq, ds, dd, _, _ = direction(0.0, 0.0)
-    length = longest_step((w, dw), (q, dq), (s, ds), (d, dd), most=_LONGEST)
-    ahead = ((w + length * dw) @ (s + length * ds) + (q + length * dq) @ (d + length * dd)) / count
-    mu = mehrotra_target(mu, ahead / mu, _LEAST_CENTRING)
-    dw, dq, ds, dd, dv, dt = direction(mu - dw * ds, mu - dq * dd)
+
+    def predict_and_correct(number, move):
+        """First the predictor, from no move at all; then the corrector, from what the predictor would do."""
+        dw, dq, ds, dd, _, _ = move
+        length = longest_step((w, dw), (q, dq), (s, ds), (d, dd), most=_LONGEST)
+        ahead = ((w + length * dw) @ (s + length * ds) + (q + length * dq) @ (d + length * dd)) / count
+        goal = jnp.where(number == 0, 0.0, mehrotra_target(mu, ahead / mu, _LEAST_CENTRING))
+        return direction(goal - dw * ds, goal - dq * dd)
+
+    zero = jnp.zeros_like(v)
+    move = jax.lax.fori_loop(0, 2, predict_and_correct, (0.0 * w, 0.0 * q, 0.0 * s, 0.0 * d, zero, zero))
+    dw, dq, ds, dd, dv, dt = move
     length = longest_step((w, dw), (q, dq), (s, ds), (d, dd), to_boundary=_TO_BOUNDARY)
     moved = (w + length * dw, q + length * dq, v + length * dv, t + length * dt)
     is_finite = jnp.isfinite(length) & jnp.isfinite(moved[0].sum() + moved[1].sum() + moved[2] + moved[3])

@@ -397,17 +397,6 @@ def test_a_model_without_features_is_refused():
         lpal(gridworld(4).mdp, np.zeros(0))
 
 
-def test_traced_input_is_refused():
-    here = dense(6)
-    for function, argument in (
-        (lambda mdp: lpal(mdp, np.zeros(6)), here.mdp),
-        (lambda expectations: lpal(here.mdp, expectations), jnp.zeros(6)),
-        (lambda policy: lpal(here.mdp, np.zeros(6), initial_policy=policy), jnp.full((6, 2), 0.5)),
-    ):
-        with pytest.raises(ValueError, match="call it outside jit and vmap"):
-            jax.jit(function)(argument)
-
-
 # ------------------------------------------------------------------------------------- prepared models
 
 

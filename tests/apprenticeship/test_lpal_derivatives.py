@@ -198,13 +198,6 @@ def test_second_derivatives_are_refused(outer):
         outer(jax.grad(margin))
 
 
-@pytest.mark.parametrize("transform", [jax.jit, jax.vmap])
-def test_gradients_inside_jit_and_vmap_are_refused(transform):
-    here = instance("dense")
-    with pytest.raises(ValueError, match="call it outside jit and vmap"):
-        transform(jax.grad(lambda e: lpal(here.mdp, e).margin))(jnp.asarray(here.arrays["expectations"]))
-
-
 def test_without_differentiation_nothing_is_added(monkeypatch):
     def refuse(*_):
         raise AssertionError("derivatives were prepared")

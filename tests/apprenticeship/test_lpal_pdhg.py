@@ -55,6 +55,8 @@ def random_problem(name, lanes, rng):
         t=rng.normal(size=pairs),
         v=rng.normal(size=features),
         weight=rng.uniform(0.1, 10.0, size=lanes),
+        x=np.zeros(pairs),
+        value=np.zeros((pairs[0], lanes)),
         change=one,
         moved=one,
         iterations=one.astype(np.int32),
@@ -85,12 +87,11 @@ def test_one_iteration(name, lanes, rng):
     t, v = np.asarray(state.t).reshape(-1, lanes), np.asarray(state.v)
     x, w = np.maximum(t, 0.0), simplex((np.asarray(goal.expectations) - v) / np.asarray(state.weight))
     u = v + np.asarray(state.weight) * w
-    near = projected(*affine_rows(arrays, here._order), np.concatenate([2 * x - t, 2 * u - v]))
+    near = projected(*affine_rows(arrays, here.order), np.concatenate([2 * x - t, 2 * u - v]))
     after = jax.jit(flow_splitting._iterate)(here.splitting, goal, state)
     np.testing.assert_allclose(after.t.reshape(-1, lanes), t + RELAXATION * (near[: len(t)] - x), rtol=0, atol=1e-8)
     np.testing.assert_allclose(after.v, v + RELAXATION * (near[len(t) :] - u), rtol=0, atol=1e-8)
-    read, weights, _ = jax.jit(flow_splitting.reading)(here.splitting, goal, state)
-    np.testing.assert_allclose(read.reshape(-1, lanes), np.maximum(near[: len(t)], 0.0), rtol=0, atol=1e-8)
+    _, weights, _ = jax.jit(flow_splitting.reading)(here.splitting, goal, state)
     np.testing.assert_allclose(weights, w, rtol=0, atol=1e-12)
 
 
@@ -106,6 +107,11 @@ def test_the_weight_changes_no_point(rng):
     chex.assert_trees_all_close(*points, rtol=0, atol=1e-9)
     change = np.abs(plain.t - before.t).sum(axis=(0, 1)) / RELAXATION
     np.testing.assert_allclose(after.change, change, rtol=1e-9)
+    x = np.maximum(before.t, 0.0) + (plain.t - before.t) / RELAXATION
+    np.testing.assert_allclose(after.x, x, rtol=0, atol=1e-9)
+    read, _, value = flow_splitting.reading(here.splitting, goal, after)
+    np.testing.assert_allclose(read, np.maximum(x, 0.0), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(value, plain.value, rtol=0, atol=1e-9)
     first = flow_splitting.point(here.splitting, goal, state)
     np.testing.assert_allclose(after.moved, np.abs(points[0].w - first.w).sum(axis=0), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(after.iterations, 1 + STEPS_PER_WEIGHT)

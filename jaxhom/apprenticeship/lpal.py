@@ -29,11 +29,12 @@ from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features, checked_expectations, checked_start
 from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.columns import solve_by_columns
-from jaxhom.apprenticeship.in_program import ITERATIONS, Program, solve_in_program
+from jaxhom.apprenticeship.in_program import ITERATIONS, solve_in_program
 from jaxhom.apprenticeship.interior_point import solve_by_interior_point
 from jaxhom.apprenticeship.pdhg import solve_by_pdhg
 from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectations
+from jaxhom.apprenticeship.program import Program
 from jaxhom.apprenticeship.quickest import solve_by_the_quickest
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.sensitivity import with_derivatives, without_tangents

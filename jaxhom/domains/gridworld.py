@@ -87,7 +87,7 @@ def gridworld(
     Source: Boularias and Chaib-draa 2010, section VI.A.
     """
     size = checks.require_count("size", size)
-    if not 0.0 <= noise <= 1.0:
+    if not 0.0 <= checks.as_host_array("noise", noise) <= 1.0:
         raise ValueError(f"noise must lie in [0, 1], got {noise}")
     row, column = start
     if not (0 <= row < size and 0 <= column < size):

@@ -31,6 +31,7 @@ def sample_walks(
       Fields of `Demonstrations`: `states`, `actions` and `mask` [M, H], 0 where a walk has ended; where states are
       terminal also `terminated` and `final_states` [M].
     """
+    mdp, policy = jax.lax.stop_gradient((mdp, policy))  # draws are constants
     initial_key, steps_key = jax.random.split(key)
     lanes = (num_walks,)
     uniform = jax.random.uniform(initial_key, lanes, mdp.dtype)

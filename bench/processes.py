@@ -228,10 +228,10 @@ def run(
         build, slowest = build + build_s, max(slowest, median)
         answers += getattr(found, "read", list)(solved)
         seconds += [median / len(group)] * len(group)
-    yield Found(*map(list, zip(*answers, strict=True)), seconds, build, compile_s, peak_gb=_peak_gb())
+    yield Found(*map(list, zip(*answers, strict=True)), seconds, build, compile_s, peak_gb=peak_gb())
 
 
-def _peak_gb() -> float:
+def peak_gb() -> float:
     """The most memory that this process held, in 1e9 bytes."""
     status = pathlib.Path("/proc/self/status")
     if status.exists():  # `getrusage` begins at what the parent held

@@ -1,11 +1,11 @@
 """How fast the library is, next to other solvers on the same instances.
 
-    python -m bench.speed similarity | lpal | planning [--quick] [--sections NAME ...] [--methods NAME ...]
+    python -m bench.speed similarity | lpal | planning | first [--quick] [--sections NAME ...] [--methods NAME ...]
 
 writes one row per measurement to `bench/results/speed_KIND.csv`, and from the rows alone a Markdown table and a log-log
 figure beside it; `--report` makes these two again from the rows on disk without measuring anything. Where `--sections`
 or `--methods` are given, the other rows on disk stay. This module never imports JAX: every section runs in a process of
-its own (`bench.similarity_speed`, `bench.lpal_speed`, `bench.planning_speed`).
+its own (`bench.similarity_speed`, `bench.lpal_speed`, `bench.planning_speed`, `bench.first_speed`).
 """
 
 import argparse
@@ -87,6 +87,17 @@ KINDS = {
         table=speed_report.planning_table,
         figure=speed_report.planning_figure,
         has_methods=True,
+    ),
+    "first": Kind(
+        title="the whole path as one program of a key, compiled and mapped over draws",
+        sections=("draws_grid16", "draws_grid16_two_devices", "draws_racetrack_a"),
+        quick=("draws_grid16",),
+        fields=(
+            *("section", "instance", "method", "draws", "devices", "prepare_s", "first_s", "seconds", "peak_gb"),
+            *("settled", "status", "note", "versions", "commit"),
+        ),
+        table=speed_report.first_table,
+        figure=lambda rows: None,
     ),
 }
 

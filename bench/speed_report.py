@@ -304,3 +304,30 @@ def planning_figure(rows: list[dict]) -> Figure | None:
         grids = [row for row in rows if row["work"] == work and row["section"].startswith("grid") and is_settled(row)]
         panels[title, "states"] = curves(grids, lambda row: row["method"].split()[0], "S", "seconds")
     return figure(panels, (5.2, 5.0), "seconds per lane")
+
+
+_FIRST_WORDS = f"""{_MADE}
+A draw goes from a key to the value of the learned policy. "settled" is the share of draws whose votes and radii are
+those of the plain calls, and whose certificates overlap theirs and are closed; of rows without plain calls beside them,
+the share of closed certificates."""
+_FIRST_HEADER = [
+    "| method | draws | devices | prepared s | first call s | ms a draw | GB | settled |",
+    "|:--|--:|--:|--:|--:|--:|--:|--:|",
+]
+
+
+def first_table(rows: list[dict]) -> str:
+    """A table for each domain: a line per row."""
+    parts = []
+    for title in dict.fromkeys(row["instance"] for row in rows if row["status"] == "measured"):
+        members = [row for row in rows if row["instance"] == title and row["status"] == "measured"]
+        parts.append((title, _FIRST_HEADER, [_first_cells(row) for row in members]))
+    failed = [f"{row['section']}: {row['status']}, {row['note']}" for row in rows if row["status"] != "measured"]
+    return "\n".join([document("Draws of the whole path", _FIRST_WORDS, parts), *failed])
+
+
+def _first_cells(row: dict) -> list:
+    times = shown(row, prepare_s=".1f", first_s=".1f")
+    seconds = number(row, "seconds")
+    draw = "" if seconds is None else f"{1e3 * seconds:.3g}"
+    return [row["method"], row["draws"], row["devices"], *times, draw, *shown(row, peak_gb=".2g", settled=".0%")]

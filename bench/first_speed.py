@@ -1,0 +1,156 @@
+"""Measures the path from demonstrations to the learned policy as one program of a key, compiled and mapped over draws.
+
+A section is a domain. Its rows: the program over all draws at once, the same sharded over two devices that are forced
+on the host, and the plain calls in a loop. They are judged against each other: votes and radii have to be the same draw
+by draw, and the bounds of margins have to overlap. "settled" is the share of draws for which that holds and whose
+certificates are closed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np  # noqa: E402
+
+import jaxhom  # noqa: E402
+from bench.processes import peak_gb  # noqa: E402
+from bench.provenance import provenance  # noqa: E402
+
+SEED = 0
+_LOOP = 5  # draws of the plain calls, after the first
+_PACKAGES = ("jax", "numpy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Domain:
+    """What draws are made of.
+
+    Attributes:
+      title: for tables.
+      path: prepares what is concrete, and returns the path from a key to its results.
+      draws: at a time; quick: of a quick run.
+      devices: over which they are sharded.
+    """
+
+    title: str
+    path: Callable[[], Callable[[Any], dict]]
+    draws: int
+    quick: int
+    devices: int = 1
+
+
+def _grid() -> Callable[[Any], dict]:
+    """Section VI.A: 10 demonstrations of 50 steps, Algorithm 1, expectations, LPAL, and the learned policy's value."""
+    mdp = jaxhom.gridworld(16, num_regions=64).mdp
+    reward = mdp.features @ jaxhom.sample_weights(jax.random.key(SEED), 64)
+    expert = jaxhom.optimal_policy(mdp, reward).policy
+    table = jaxhom.SimilarityTable(mdp).complete()
+
+    def path(key):
+        walks = jaxhom.sample_demonstrations(key, mdp, expert, 10, 50)
+        general = jaxhom.soft_local_homomorphism(mdp, walks, table=table)
+        vhat = jaxhom.feature_expectations(mdp, general.policy)
+        learned = jaxhom.lpal(mdp, vhat, initial_policy=general.policy)
+        value = jaxhom.policy_value(mdp, learned.policy, reward) @ mdp.initial
+        bounds = {"lower": learned.margin, "upper": learned.margin_bound, "status": learned.status}
+        return {"radius": general.radius, "value": value} | bounds
+
+    return path
+
+
+def _racetrack() -> Callable[[Any], dict]:
+    """Section VI.B: 5 demonstrations of at most 100 steps, Algorithm 1, and its policy's value. No LPAL."""
+    track = jaxhom.racetrack("a")
+    expert = jaxhom.optimal_policy(track.mdp, track.reward).policy
+    table = jaxhom.SimilarityTable(track.mdp).complete()
+
+    def path(key):
+        walks = jaxhom.sample_demonstrations(key, track.mdp, expert, 5, 100, terminal=track.terminal)
+        general = jaxhom.soft_local_homomorphism(track.mdp, walks, table=table)
+        value = jaxhom.policy_value(track.mdp, general.policy, track.reward) @ track.mdp.initial
+        return {"radius": general.radius, "value": value, "lower": value, "upper": value, "status": general.status}
+
+    return path
+
+
+DOMAINS = {
+    "draws_grid16": Domain("16 x 16 grid, 64 regions, with LPAL", _grid, 100, 8),
+    "draws_grid16_two_devices": Domain("16 x 16 grid, 64 regions, with LPAL", _grid, 100, 8, devices=2),
+    "draws_racetrack_a": Domain("racetrack (a), without LPAL", _racetrack, 8, 2),
+}
+
+
+def section(name: str, quick: bool, methods: None, limit: None) -> Iterator[dict]:
+    """The rows of a domain."""
+    del methods, limit
+    domain = DOMAINS[name]
+    if domain.devices > 1:  # before the first computation
+        flag = f"--xla_force_host_platform_device_count={domain.devices}"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
+    draws = domain.quick if quick else domain.draws
+    begun = time.perf_counter()
+    path = domain.path()
+    prepared = time.perf_counter() - begun
+    keys = jax.random.split(jax.random.key(SEED), draws)
+    fields = {"instance": domain.title, "draws": draws, "devices": domain.devices, "prepare_s": prepared}
+    fields |= {"status": "measured", "note": ""} | provenance(*_PACKAGES)
+    first, seconds, found = _measured(_program(path, domain.devices), keys)
+    inside = {"method": "jaxhom jit vmap", "first_s": first, "seconds": seconds / draws, "peak_gb": peak_gb()}
+    if domain.devices > 1:
+        yield fields | inside | {"settled": float((found["status"] == 0).mean())}
+        return
+    first, seconds, plain = _looped(path, keys[: _LOOP + 1])
+    yield fields | inside | {"settled": _agreement(found, plain)}
+    yield fields | {
+        "method": "jaxhom in a loop",
+        "draws": len(plain["status"]),
+        "first_s": first,
+        "seconds": seconds,
+        "settled": float((plain["status"] == 0).mean()),
+    }
+
+
+def _program(path: Callable, devices: int) -> Callable:
+    mapped = jax.vmap(path)
+    if devices == 1:
+        return jax.jit(mapped)
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("draws",))
+    spec = jax.sharding.PartitionSpec("draws")
+    return jax.jit(jax.shard_map(mapped, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+
+
+def _measured(run: Callable, keys) -> tuple[float, float, dict]:
+    """Seconds of the first call, which compiles, the median of three more, and what is found."""
+    times = []
+    for _ in range(4):
+        begun = time.perf_counter()
+        found = jax.block_until_ready(run(keys))
+        times.append(time.perf_counter() - begun)
+    return times[0], float(np.median(times[1:])), jax.tree.map(np.asarray, found)
+
+
+def _looped(path: Callable, keys) -> tuple[float, float, dict]:
+    """Seconds of the first draw by plain calls, the median of the others, and what is found."""
+    times, found = [], []
+    for key in keys:
+        begun = time.perf_counter()
+        found.append(jax.tree.map(np.asarray, path(key)))
+        times.append(time.perf_counter() - begun)
+    return times[0], float(np.median(times[1:])), jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+
+
+def _agreement(found: dict, plain: dict) -> float:
+    """The share of draws with the same radii, bounds that overlap, and a closed certificate."""
+    some = jax.tree.map(lambda leaf: leaf[: len(plain["status"])], found)
+    same = (some["radius"] == plain["radius"]).all(axis=1)
+    slack = 1e-9 * np.abs(plain["upper"])
+    overlap = (some["lower"] <= plain["upper"] + slack) & (plain["lower"] <= some["upper"] + slack)
+    return float((same & overlap).mean() * (found["status"] == 0).mean())

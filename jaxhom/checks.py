@@ -70,6 +70,13 @@ def eager_where_concrete(function: F) -> F:
     return call
 
 
+def refuse_traced(**options: Any) -> None:
+    """Raises if an option, given by its name, is traced."""
+    for name, value in options.items():
+        if is_traced(value):
+            raise ValueError(f"{name} is a traced value: inside jit, vmap and grad it must be a constant")
+
+
 def in_one_line(value: Any) -> str:
     """`repr` for messages: without line breaks, and cut off where it is long."""
     return " ".join(reprlib.repr(value).split())

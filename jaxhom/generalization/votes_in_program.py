@@ -98,13 +98,13 @@ def vote_of_nearest(mdp: MDP, start: Generalization, experts, coordinates) -> Vo
     everyone, chosen = jnp.arange(mdp.num_states)[:, None], _clipped(mdp, experts)
     counts = evidence.has_vote(mdp, start.policy, everyone, chosen) & (experts < mdp.num_states)
     square = jnp.where(counts, square_distances(coordinates, coordinates[chosen]), jnp.inf)
-    tie = max(TIE, 8 * float(jnp.finfo(square.dtype).eps))
-    is_found = jnp.isfinite(square.min(axis=1))
-    is_voter = is_nearest(square, tie) & is_found[:, None]
-    radius = jnp.maximum(jnp.ceil(jnp.sqrt(square.min(axis=1)) * (1 - tie)), 1)
+    least = square.min(axis=1)
+    tie = TIE + _rounding(coordinates, least)
+    is_voter = is_nearest(square, tie[:, None]) & jnp.isfinite(least)[:, None]
+    radius = jnp.maximum(jnp.ceil(jnp.sqrt(least) * (1 - tie)), 1)
     return Votes(
         policy=evidence.policy_of_votes(mdp, sum_of_policies(is_voter, start.policy, experts))[0],
-        radius=jnp.where(is_found, radius, -1).astype(jnp.int32),
+        radius=jnp.where(is_voter.any(axis=1), radius, -1).astype(jnp.int32),
         support=is_voter.sum(axis=1, dtype=jnp.int32),
     )
 
@@ -113,6 +113,13 @@ def sum_of_policies(weights, policy, experts) -> jax.Array:
     """[S, A]: the sum of the demonstrated states' policies with weights [S, E]; booleans are 0 and 1."""
     policies = policy.at[experts].get(mode="fill", fill_value=0)
     return jnp.matmul(weights.astype(policy.dtype), policies, precision=jax.lax.Precision.HIGHEST)
+
+
+def _rounding(coordinates, least) -> jax.Array:
+    """[S]: the relative difference of two squares near the `least` that rounded coordinates [S, D] may have made."""
+    limits = jnp.finfo(coordinates.dtype)
+    difference = jnp.abs(coordinates).max() * coordinates.shape[1] ** 0.5 * limits.eps
+    return 4 * (limits.eps + difference / jnp.sqrt(jnp.maximum(least, limits.tiny)))
 
 
 def _grow(mdp: MDP, experts, accepted, asking) -> _Search:

@@ -11,6 +11,7 @@ import pytest
 
 import jaxhom
 from jaxhom import MDP, Demonstrations, SimilarityTable, Status, gridworld, racetrack
+from jaxhom.generalization import votes_in_program
 from jaxhom.similarity import class_pairs
 
 EXACT = ("visited", "radius", "support", "undecided", "status")
@@ -120,6 +121,28 @@ def test_algorithm_1_draw_by_draw(name, options):
     found = assert_same_as_on_the_host(learn, draws(name), tolerance=1e-6 if name == "narrow" else 1e-14)
     assert table.num_solved == solved
     assert np.any(found.radius > 0) and np.all(found.radius[0] == -1)
+
+
+def test_many_steps_in_few_states():
+    """Sets of several words, and of all states: more steps than states."""
+    table = completed("track", 0.0, 0.6)
+    learn = functools.partial(jaxhom.soft_local_homomorphism, model("track"), table=table, tolerance=1e-3)
+    assert_same_as_on_the_host(learn, draws("track", 6, 12))
+    assert_same_as_on_the_host(functools.partial(jaxhom.nearest_neighbors, model("grid")), draws("grid", 5, 12))
+    assert_same_as_on_the_host(functools.partial(jaxhom.nearest_neighbors, model("hubs")), draws("hubs", 5, 12))
+
+
+def test_keys_and_policies_may_be_traced():
+    """Demonstrations that are drawn in the program itself."""
+    mdp, table = model("restricted"), completed("restricted", 0.0, 0.6)
+
+    def learn(key, policy):
+        shown = jaxhom.sample_demonstrations(key, mdp, policy, 2, 5)
+        return jaxhom.soft_local_homomorphism(mdp, shown, table=table, threshold=0.6, tolerance=1e-3)
+
+    expert = np.asarray(mdp.allowed) / np.asarray(mdp.allowed).sum(axis=1, keepdims=True)
+    policies = jnp.broadcast_to(expert, (COUNT, *expert.shape))
+    assert_same_as_on_the_host(learn, jax.random.split(jax.random.key(0), COUNT), policies)
 
 
 def test_algorithm_1_against_the_paper():
@@ -248,6 +271,29 @@ def test_euclidean_draw_by_draw(name):
     assert np.any(found.support > 1)
     others = jnp.asarray(0.1 * (cells + rng.integers(9, size=(COUNT, 1, 2))))
     assert_same_as_on_the_host(learn, draws(name), others, tolerance=tolerance)
+
+
+def test_rounded_coordinates_tie():
+    """Tenths in float32: distances that are the same differ in the last digits."""
+    mdp, shown = model("grid"), lane(draws("grid"), 2)
+    cells = np.stack(np.divmod(np.arange(25), 5), axis=1)
+    start = jaxhom.uniform_elsewhere(mdp, shown)
+    experts = votes_in_program.padded_experts(mdp, shown, start.visited)
+    for scale in (1e-3, 0.1, 1e4):
+        rounded = jnp.asarray(scale * (cells + 7.3), jnp.float32)
+        found = votes_in_program.vote_of_nearest(mdp, start, experts, rounded)
+        expected = jaxhom.nearest_neighbors(mdp, shown, metric="euclidean", coordinates=cells)
+        others = ~np.asarray(start.visited)
+        np.testing.assert_array_equal(found.support[others], expected.support[others])
+        np.testing.assert_allclose(found.policy[others], expected.policy[others], rtol=0, atol=1e-12)
+
+
+def test_coordinates_that_are_no_numbers_find_nobody():
+    mdp, shown = model("grid"), lane(draws("grid"), 2)
+    learn = jax.jit(lambda cells: jaxhom.nearest_neighbors(mdp, shown, metric="euclidean", coordinates=cells))
+    found = learn(jnp.full((25, 2), jnp.nan))
+    np.testing.assert_array_equal(found.radius, np.where(found.visited, 0, -1))
+    np.testing.assert_allclose(found.policy.sum(axis=1), 1.0)
 
 
 def test_uniform_elsewhere_draw_by_draw():

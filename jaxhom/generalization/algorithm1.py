@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.generalization import evidence
+from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import ByHomomorphism
 from jaxhom.generalization.result import Generalization, extend, may_vote, votes_around
 from jaxhom.generalization.uniform import uniform_elsewhere
@@ -25,9 +25,10 @@ from jaxhom.similarity.table import SimilarityTable, table_for
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
-    from jaxtyping import ArrayLike, Bool
+    from jaxtyping import Array, ArrayLike, Bool
 
 
+@checks.eager_where_concrete
 def soft_local_homomorphism(
     mdp: MDP,
     demonstrations: Demonstrations,
@@ -56,7 +57,8 @@ def soft_local_homomorphism(
       states: bool [S], the states to find a policy for; the others stay uniform. All if None. Leaving out states in
         which the action does not matter, and which lead to many, saves their large local models.
       table: a `SimilarityTable` of the same model, `distance` and `anchored`, for many sets of demonstrations or
-        thresholds: pairs of classes that it has met are not solved again. Made anew if None.
+        thresholds: pairs of classes that it has met are not solved again. Made anew if None. Under a trace it is
+        needed, and completed for the threshold: `SimilarityTable(mdp, ...).complete(threshold)`.
       progress: show a progress bar.
       similarity: the former name of `table`, which warns.
 
@@ -65,9 +67,12 @@ def soft_local_homomorphism(
       from the threshold count as different: `undecided` says how many of a state's, and `status` why.
 
     Raises:
-      ValueError: if a demonstration does not fit the model, an option is out of range, or `table` is another's.
+      ValueError: if a demonstration does not fit the model, an option is out of range or traced, or `table` is
+        another's; under a trace also if there is none, or it is not completed for the threshold.
 
-    Outside jit, vmap and grad only: local models are found on the host.
+    Works under jit and vmap with a completed table, which is the host's: no program is solved there. Demonstrations,
+    `states` and the model may be traced; a traced model is taken for the table's if it has its shapes. Values are not
+    checked there, and the result does not know how it was made. Votes have no derivatives, in whatever is traced.
 
     Example:
       >>> import jaxhom
@@ -76,19 +81,42 @@ def soft_local_homomorphism(
       >>> general = jaxhom.soft_local_homomorphism(grid, demonstrations)
       >>> general.radius.reshape(8, 8)[1].tolist()  # beside the walk, and the right border, which nothing is like
       [-1, 0, 0, 0, 1, 2, 3, -1]
+      >>> import jax
+      >>> table = jaxhom.SimilarityTable(grid).complete()
+      >>> learn = jax.jit(lambda shown: jaxhom.soft_local_homomorphism(grid, shown, table=table).radius)
+      >>> learn(demonstrations).reshape(8, 8)[1].tolist()
+      [-1, 0, 0, 0, 1, 2, 3, -1]
 
     Source: Boularias and Chaib-draa 2010, Algorithm 1; anchoring and `mutual` are additions.
     """
     if similarity is not None:
-        warnings.warn("similarity is now called table", DeprecationWarning, stacklevel=2)
+        warnings.warn("similarity is now called table", DeprecationWarning, stacklevel=3)
         if table is not None:
             raise ValueError("similarity is the former name of table: give one of them")
         table = similarity
+    checks.refuse_traced(distance=distance, threshold=threshold, anchored=anchored, mutual=mutual, tolerance=tolerance)
     mdp = as_model(mdp)
+    is_traced = checks.is_traced(mdp, demonstrations, states)
+    if is_traced and table is None:
+        raise ValueError(
+            "table is needed where something is traced: solve all pairs of classes outside jit, vmap and grad with "
+            "SimilarityTable(mdp, ...).complete(threshold), and close over it"
+        )
     table = table_for(table, mdp, distance, anchored)
     relation = {"threshold": threshold, "mutual": mutual, "tolerance": tolerance}
     start = uniform_elsewhere(mdp, demonstrations)
+    if is_traced:
+        asking = ~start.visited & _asked(mdp, states)
+        experts = votes_in_program.padded_experts(mdp, demonstrations, start.visited)
+        found = votes_in_program.vote_of_rings(mdp, start, experts, asking, table.relation(**relation))
+        return extend(mdp, start, found.votes, None, undecided=found.undecided, status=found.status)
     asking = ~np.asarray(start.visited) & _asked(mdp, states)
+    votes, ended = _vote_on_host(mdp, start, asking, table, relation, progress)
+    return extend(mdp, start, votes, ByHomomorphism(mdp, table, asking, **relation), **ended)
+
+
+def _vote_on_host(mdp: MDP, start: Generalization, asking: np.ndarray, table: SimilarityTable, relation, progress):
+    """The votes around the states that ask, bool [S], and `undecided` and `status`; solves the pairs that it meets."""
     # All classes that will be met, at once: programs are as wide as the widest class that is known.
     table.classes(np.flatnonzero(asking | evidence.deciding(mdp, start.visited)))
     can_vote, status = may_vote(mdp, start), Status.SOLVED
@@ -109,13 +137,13 @@ def soft_local_homomorphism(
         "undecided": checks.to_device(undecided, jnp.int32),
         "status": checks.to_device(np.asarray(status), jnp.int32),
     }
-    return extend(mdp, start, votes, ByHomomorphism(mdp, table, asking, **relation), **ended)
+    return votes, ended
 
 
-def _asked(mdp: MDP, states) -> np.ndarray:
+def _asked(mdp: MDP, states) -> np.ndarray | Array:
     """bool [S]: the states that a policy is wanted for."""
     if states is None:
         return np.ones(mdp.num_states, bool)
-    states = checks.as_host_array("states", states)
+    states = states if checks.is_traced(states) else checks.as_host_array("states", states)
     checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == (mdp.num_states,))
     return states.astype(bool)

@@ -1,4 +1,4 @@
-"""What a demonstrated state may say to other states; on the host.
+"""What a demonstrated state may say to other states; on the host, and inside programs where anything is traced.
 
 Two rules, whatever the method that carries the expert's policy over:
 
@@ -8,31 +8,47 @@ Two rules, whatever the method that carries the expert's policy over:
   vote there.
 """
 
+import jax.numpy as jnp
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.models.mdp import MDP, absorbing_states, uniform_policy
 
 
-def deciding(mdp: MDP, visited) -> np.ndarray:
+def deciding(mdp: MDP, visited):
     """bool [S]: the demonstrated states in which there was something to decide."""
-    return np.asarray(visited) & ~np.asarray(absorbing_states(mdp))
+    absorbs = absorbing_states(mdp)
+    xp = _arrays_of(visited, absorbs)
+    return xp.asarray(visited) & ~xp.asarray(absorbs)
 
 
-def has_vote(mdp: MDP, policy, states: np.ndarray, experts: np.ndarray) -> np.ndarray:
-    """bool [P]: whether the expert's `policy` [S, A] in `experts` [P] takes actions that `states` [P] have."""
+def has_vote(mdp: MDP, policy, states, experts):
+    """bool [P]: whether the expert's `policy` [S, A] in `experts` [P] takes actions that `states` [P] have.
+
+    Indices of shapes that broadcast, [S, 1] and [E], give every pair of them.
+    """
     if not mdp.restricts_actions:
-        return np.ones(len(states), bool)
-    return ((np.asarray(policy)[experts] > 0) & np.asarray(mdp.allowed)[states]).any(axis=-1)
+        return np.ones(np.broadcast_shapes(np.shape(states), np.shape(experts)), bool)
+    xp = _arrays_of(mdp.allowed, policy, states, experts)
+    return ((xp.asarray(policy)[experts] > 0) & xp.asarray(mdp.allowed)[states]).any(axis=-1)
 
 
-def allowed_part(mdp: MDP, states, votes: np.ndarray) -> np.ndarray:
+def allowed_part(mdp: MDP, states, votes):
     """Votes [P, A] for `states` [P], without those for actions that these lack."""
-    return np.where(np.asarray(mdp.allowed)[states], votes, 0) if mdp.restricts_actions else votes
+    xp = _arrays_of(mdp.allowed, votes)
+    return xp.where(xp.asarray(mdp.allowed)[states], votes, 0) if mdp.restricts_actions else votes
 
 
-def policy_of_votes(mdp: MDP, votes) -> tuple[np.ndarray, np.ndarray]:
+def policy_of_votes(mdp: MDP, votes):
     """Votes [S, A] as rows that sum to 1, and bool [S]: where any counted; elsewhere the row is uniform."""
-    votes = allowed_part(mdp, slice(None), np.asarray(votes))
+    uniform = uniform_policy(mdp)
+    xp = _arrays_of(votes, uniform)
+    votes = allowed_part(mdp, slice(None), xp.asarray(votes))
     total = votes.sum(axis=1, keepdims=True)
     is_found = total > 0
-    return np.where(is_found, votes / np.where(is_found, total, 1), uniform_policy(mdp)), is_found[:, 0]
+    return xp.where(is_found, votes / xp.where(is_found, total, 1), uniform), is_found[:, 0]
+
+
+def _arrays_of(*given):
+    """NumPy, or JAX's where something is traced."""
+    return jnp if checks.is_traced(given) else np

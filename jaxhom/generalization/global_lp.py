@@ -7,6 +7,9 @@ LP (8) of Boularias and Chaib-draa 2010: maps f [S, E] from all states to the E 
 with T^E the model restricted to the demonstrated states. As for the local program, e = min_f max_{|y|_1 <= 1} <y, K f>,
 any f gives an upper and any y a lower bound. The products with T are the model's own sweeps with the E columns as
 their batch; T^E is a dense tensor.
+
+Inside programs the demonstrated states are a list of static length that is padded: the columns of its padding stay 0
+in f and y.
 """
 
 import dataclasses
@@ -27,11 +30,13 @@ class GlobalHomomorphismProblem:
       mdp: the model.
       restricted: [E, A, E], T^E.
       pinned: bool [S, E]; a row with a True is fixed to that entry. All False in the program as printed.
+      exists: bool [E]; False on padding, where T^E is zero.
     """
 
     mdp: MDP
     restricted: jax.Array
     pinned: jax.Array
+    exists: jax.Array
 
     def start(self) -> tuple[jax.Array, jax.Array]:
         """Uniform rows, and y = 0."""
@@ -41,8 +46,9 @@ class GlobalHomomorphismProblem:
 
     def forward(self, f: jax.Array) -> jax.Array:
         """K f."""
-        moved = expected_next_value(self.mdp, f[..., 0])
-        return (moved - jnp.einsum("sl,lak->sak", f[..., 0], self.restricted))[..., None]
+        f = jnp.where(self.exists, f[..., 0], 0.0)
+        moved = expected_next_value(self.mdp, f)
+        return (moved - jnp.einsum("sl,lak->sak", f, self.restricted))[..., None]
 
     def adjoint(self, y: jax.Array) -> jax.Array:
         """K^T y."""
@@ -52,7 +58,9 @@ class GlobalHomomorphismProblem:
     def project_primal(self, point: jax.Array, step) -> jax.Array:
         """Rows onto the simplex; pinned rows to their entry."""
         del step
-        f = project_simplex(point[..., 0], axis=1)
+        point = point[..., 0]
+        largest = jnp.max(point, axis=1, keepdims=True, where=self.exists, initial=jnp.finfo(point.dtype).min)
+        f = project_simplex(jnp.where(self.exists, point, largest - 2.0), axis=1)  # 0 where 1 below the largest
         is_pinned = self.pinned.any(axis=1, keepdims=True)
         return jnp.where(is_pinned, self.pinned.astype(f.dtype), f)[..., None]
 
@@ -68,12 +76,16 @@ class GlobalHomomorphismProblem:
         eps = jnp.finfo(forward.dtype).eps
         defect = jnp.abs(f.sum(axis=1) - 1.0).max()
         upper = jnp.abs(forward).max() + 2.0 * defect + (self.mdp.probability.shape[-1] + num_experts + 2) * eps
-        lowest = jnp.where(self.pinned.any(axis=1), (self.pinned * adjoint).sum(axis=1), adjoint.min(axis=1))
+        lowest = jnp.where(self.pinned.any(axis=1), (self.pinned * adjoint).sum(axis=1), self._least(adjoint))
         value = lowest.sum() / jnp.maximum(jnp.abs(y).sum(), 1.0)
         # Rounding in K^T y is relative to the |y| that is summed, whose total is 1, spread over the chains of sums.
         rounding = 4.0 * (num_actions * num_experts + self.mdp.probability.shape[-1]) * eps
         lower = jnp.maximum(value - rounding - jnp.sqrt(num_states) * eps, 0.0)
         return lower[None], upper[None]
+
+    def _least(self, adjoint: jax.Array) -> jax.Array:
+        """[S]: the least entry of each row that is no padding."""
+        return jnp.where(self.exists, adjoint, jnp.inf).min(axis=1)
 
     def norm_bound(self) -> jax.Array:
         """sqrt(|K|_1 |K|_inf), from the row and column sums of T and T^E."""
@@ -81,3 +93,18 @@ class GlobalHomomorphismProblem:
         into_states = push_forward(self.mdp, ones).max()
         into_experts = self.restricted.sum(axis=0).max()
         return jnp.sqrt((into_states + self.mdp.num_actions) * (1.0 + into_experts))[None]
+
+
+def restricted_to_list(mdp: MDP, experts: jax.Array) -> jax.Array:
+    """T^E [E, A, E] for a list of different states [E] that is padded with S; inside programs.
+
+    Transitions that leave the set become self-loops on the state they leave. Padding has no transitions. An entry adds
+    up to N numbers, which is exact to N times eps.
+    """
+    count, num_states = len(experts), mdp.num_states
+    column = jnp.full(num_states, count, jnp.int32).at[experts].set(jnp.arange(count, dtype=jnp.int32), mode="drop")
+    target = column[mdp.next_state.at[experts].get(mode="clip")]
+    own, action = jnp.arange(count)[:, None, None], jnp.arange(mdp.num_actions)[:, None]
+    probability = mdp.probability.at[experts].get(mode="fill", fill_value=0)
+    zeros = jnp.zeros((count, mdp.num_actions, count), mdp.dtype)
+    return zeros.at[own, action, jnp.where(target < count, target, own)].add(probability)

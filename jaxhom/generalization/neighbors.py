@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.generalization import evidence
+from jaxhom import checks
+from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import ByCoordinates, ByHops
 from jaxhom.generalization.result import Generalization, extend, may_vote, votes_around
 from jaxhom.generalization.uniform import uniform_elsewhere
-from jaxhom.generalization.votes import vote_of_nearest
+from jaxhom.generalization.votes import Votes, vote_of_nearest
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model, check_coordinates
 from jaxhom.models.mdp import MDP
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float
 
 
+@checks.eager_where_concrete
 def nearest_neighbors(
     mdp: MDP,
     demonstrations: Demonstrations,
@@ -42,13 +45,18 @@ def nearest_neighbors(
     Raises:
       ValueError: if a demonstration does not fit the model, or `metric` or `coordinates` do not.
 
-    Outside jit, vmap and grad only: the model's graph is searched on the host.
+    Works under jit and vmap, whatever is traced but `metric`. Values are not checked there, and the result does not
+    know how it was made; distances are in JAX's default type. Votes have no derivatives.
 
     Example:
       >>> import jaxhom
       >>> grid = jaxhom.gridworld(4)
       >>> demonstrations = jaxhom.Demonstrations.from_trajectories([([0, 1], [2, 2])])
       >>> jaxhom.nearest_neighbors(grid, demonstrations).radius.reshape(4, 4)[0].tolist()
+      [0, 0, 1, 2]
+      >>> import jax
+      >>> learn = jax.jit(lambda shown: jaxhom.nearest_neighbors(grid, shown).radius)
+      >>> learn(demonstrations).reshape(4, 4)[0].tolist()
       [0, 0, 1, 2]
       >>> near = jaxhom.nearest_neighbors(grid, demonstrations, metric="euclidean", coordinates=grid.coordinates)
       >>> near.support[2]
@@ -57,16 +65,24 @@ def nearest_neighbors(
     Source: Boularias and Chaib-draa 2010, section VI (k-NN).
     """
     mdp = as_model(mdp)
-    if metric == "hops":
-        start = uniform_elsewhere(mdp, demonstrations)
+    if metric not in ("hops", "euclidean"):
+        raise ValueError(f'metric must be "hops" or "euclidean", got {metric!r}')
+    if metric == "euclidean" and coordinates is None:
+        raise ValueError('metric="euclidean" needs coordinates [S, D]')
+    coordinates = check_coordinates(mdp, coordinates) if metric == "euclidean" else None
+    start = uniform_elsewhere(mdp, demonstrations)
+    if checks.is_traced(mdp, demonstrations, coordinates):
+        return extend(mdp, start, _votes_in_program(mdp, demonstrations, start, coordinates), None)
+    if coordinates is None:
         votes = votes_around(mdp, start, may_vote(mdp, start), ~np.asarray(start.visited))
         return extend(mdp, start, votes, ByHops(mdp))
-    if metric != "euclidean":
-        raise ValueError(f'metric must be "hops" or "euclidean", got {metric!r}')
-    if coordinates is None:
-        raise ValueError('metric="euclidean" needs coordinates [S, D]')
-    coordinates = check_coordinates(mdp, coordinates)
-    start = uniform_elsewhere(mdp, demonstrations)
     accept = may_vote(mdp, start) if mdp.restricts_actions else None
     votes = vote_of_nearest(evidence.deciding(mdp, start.visited), np.asarray(start.policy), coordinates, accept)
     return extend(mdp, start, votes, ByCoordinates(mdp, coordinates))
+
+
+def _votes_in_program(mdp: MDP, demonstrations: Demonstrations, start: Generalization, coordinates) -> Votes:
+    experts = votes_in_program.padded_experts(mdp, demonstrations, start.visited)
+    if coordinates is None:
+        return votes_in_program.vote_of_rings(mdp, start, experts, ~start.visited).votes
+    return votes_in_program.vote_of_nearest(mdp, start, experts, jnp.asarray(coordinates, float))

@@ -43,6 +43,7 @@ _TOLERANCE = 1e-7  # of the objective and of the residuals, as a share of all di
 _GOOD_ENOUGH = 1e-5  # beyond which HiGHS has to do it
 
 
+@checks.eager_where_concrete
 def occupancy_regression(
     mdp: MDP, demonstrations: Demonstrations, coordinates: Float[ArrayLike, "S D"]
 ) -> Generalization:
@@ -58,10 +59,10 @@ def occupancy_regression(
       do not absorb, all of which have a say; -1 and 0 where the state hardly ever occurs and the policy is uniform.
 
     Raises:
-      ValueError: if a demonstration does not fit the model, or `coordinates` do not.
+      ValueError: if a demonstration does not fit the model, `coordinates` do not, or anything is traced.
       RuntimeError: if no solver finds an optimum.
 
-    Outside jit, vmap and grad only: the linear program is solved on the host.
+    The linear program is solved on the host: inside jit, vmap and grad of concrete values alone.
 
     Example:
       >>> import jaxhom
@@ -74,6 +75,11 @@ def occupancy_regression(
     Source: Boularias and Chaib-draa 2010, section VI; the linear program is written out above.
     """
     mdp = as_model(mdp)
+    if checks.is_traced(mdp, demonstrations, coordinates):
+        raise ValueError(
+            "the linear program of occupancy_regression is solved on the host: call it outside jit, vmap and grad, or "
+            "use nearest_neighbors or soft_local_homomorphism there"
+        )
     basis = quadratic_basis(check_coordinates(mdp, coordinates))
     visited, empirical = (np.asarray(array) for array in empirical_policy(mdp, demonstrations))
     decides = evidence.deciding(mdp, visited)

@@ -53,6 +53,7 @@ class Generalization(Record):
         default=None, metadata={"dropped": True}
     )
 
+    @checks.eager_where_concrete
     def explain(self, state: Int[ArrayLike, ""]) -> Explanation:
         """Says where a state's policy came from; `print` it, or read its arrays.
 
@@ -88,7 +89,7 @@ def extend(mdp: MDP, start: Generalization, votes: Votes, explainer, **more) -> 
       mdp: the model.
       start: from `uniform_elsewhere`.
       votes: for all states; those of demonstrated states do not count.
-      explainer: what explains the result.
+      explainer: what explains the result; None under a trace.
       **more: further fields of the result.
     """
     policy = evidence.policy_of_votes(mdp, votes.policy)[0] if mdp.restricts_actions else votes.policy

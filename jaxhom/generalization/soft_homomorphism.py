@@ -5,15 +5,17 @@ LP (8) of Boularias and Chaib-draa 2010, which the paper gave up for its size; `
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from jaxhom import checks
-from jaxhom.generalization import evidence
+from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import LEAST_SHARE, ByGlobalMap
-from jaxhom.generalization.global_lp import GlobalHomomorphismProblem
+from jaxhom.generalization.global_lp import GlobalHomomorphismProblem, restricted_to_list
 from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
@@ -27,6 +29,7 @@ from jaxhom.status import Status
 _ITERATIONS_PER_REPORT = 320  # a program cannot be interrupted
 
 
+@checks.eager_where_concrete
 def soft_homomorphism(
     mdp: MDP,
     demonstrations: Demonstrations,
@@ -54,9 +57,12 @@ def soft_homomorphism(
       and the error is infinite), the policy is uniform, with radius -1 and support 0.
 
     Raises:
-      ValueError: if a demonstration does not fit the model, or the tolerance is not positive.
+      ValueError: if a demonstration does not fit the model, the tolerance is not positive, or an option is traced.
 
-    Outside jit, vmap and grad only: the part of the model that was demonstrated is found on the host.
+    Works under jit and vmap, whatever is traced but the options. E is then the number of all states or of all recorded
+    steps, if fewer, whatever was visited. Values are not checked there, `progress` shows nothing, the result does not
+    know how it was made, and what is not finite ends the iterations at once, with bounds that are not either. No
+    derivatives.
 
     Example:
       >>> import jaxhom
@@ -64,33 +70,88 @@ def soft_homomorphism(
       >>> general = jaxhom.soft_homomorphism(jaxhom.gridworld(3), demonstrations, tolerance=1e-2)
       >>> jaxhom.Status(int(general.status)).name, bool(general.error_upper - general.error_lower <= 1e-2)
       ('SOLVED', True)
+      >>> import jax
+      >>> learn = jax.jit(lambda shown: jaxhom.soft_homomorphism(jaxhom.gridworld(3), shown, tolerance=1e-2))
+      >>> again = learn(demonstrations)
+      >>> bool(again.error_lower <= general.error_upper), bool(general.error_lower <= again.error_upper)
+      (True, True)
 
     Source: Boularias and Chaib-draa 2010, eq. (8). The paper gave it up for its size.
     """
+    checks.refuse_traced(anchored=anchored, tolerance=tolerance, max_iterations=max_iterations)
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
     mdp = as_model(mdp)
     start = uniform_elsewhere(mdp, demonstrations)
+    if checks.is_traced(mdp, demonstrations):
+        experts = votes_in_program.padded_experts(mdp, demonstrations, start.visited)
+        return _generalization(mdp, start, _solve_in_program(mdp, start, experts, anchored, tolerance, max_iterations))
     experts = np.flatnonzero(evidence.deciding(mdp, start.visited))
-    if not experts.size:
-        mapping, lower, upper, status = np.zeros((mdp.num_states, 0)), np.inf, np.inf, Status.SOLVED
-    else:
-        problem = _problem(mdp, experts, anchored)
-        state = _solve_with_progress(problem, tolerance, max_iterations, progress)
-        mapping, lower, upper = np.asarray(state.best_primal[..., 0]), state.lower[0], state.upper[0]
-        is_met = is_settled(float(lower), float(upper), tolerance)
-        status = Status.SOLVED if is_met else Status.ITERATION_LIMIT
-    policy, is_found = evidence.policy_of_votes(mdp, mapping @ np.asarray(start.policy)[experts])
-    visited = start.visited
+    solved = _solve_on_host(mdp, start, experts, anchored, tolerance, max_iterations, progress)
+    explainer = ByGlobalMap(mdp, experts, solved.mapping, float(solved.lower), float(solved.upper), anchored)
+    return _generalization(mdp, start, solved).replace(explainer=explainer)
+
+
+class _Solved(NamedTuple):
+    """A map [S, E], the expert's policies averaged by it [S, A], and bounds on the optimal error."""
+
+    votes: np.ndarray | jax.Array
+    mapping: np.ndarray | jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    status: int | jax.Array
+
+
+def _generalization(mdp: MDP, start: Generalization, solved: _Solved) -> Generalization:
+    """The averages as a policy; uniform where nothing is left of them."""
+    policy, is_found = evidence.policy_of_votes(mdp, solved.votes)
+    visited, chosen = start.visited, (solved.mapping > LEAST_SHARE).sum(axis=1)
     return start.replace(
         policy=jnp.where(visited[:, None], start.policy, checks.to_device(policy, mdp.dtype)),
-        radius=jnp.where(visited, 0, np.where(is_found, 1, -1)).astype(jnp.int32),
-        support=jnp.where(visited, 1, np.where(is_found, (mapping > LEAST_SHARE).sum(axis=1), 0)).astype(jnp.int32),
-        error_lower=checks.to_device(lower, mdp.dtype),
-        error_upper=checks.to_device(upper, mdp.dtype),
-        status=checks.to_device(np.asarray(status), jnp.int32),
-        explainer=ByGlobalMap(mdp, experts, mapping, float(lower), float(upper), anchored),
+        radius=jnp.where(visited, 0, jnp.where(is_found, 1, -1)).astype(jnp.int32),
+        support=jnp.where(visited, 1, jnp.where(is_found, chosen, 0)).astype(jnp.int32),
+        error_lower=checks.to_device(solved.lower, mdp.dtype),
+        error_upper=checks.to_device(solved.upper, mdp.dtype),
+        status=checks.to_device(solved.status, jnp.int32),
+        explainer=None,
     )
+
+
+def _solve_on_host(mdp: MDP, start, experts: np.ndarray, anchored, tolerance, max_iterations, progress) -> _Solved:
+    """The map to the given states, with a look at the clock and the keyboard every few hundred iterations."""
+    if not experts.size:
+        nothing = np.zeros((mdp.num_states, mdp.num_actions))
+        return _Solved(nothing, nothing[:, :0], np.inf, np.inf, Status.SOLVED)
+    problem = _problem(mdp, experts, anchored)
+    state = _solve_with_progress(problem, tolerance, max_iterations, progress)
+    lower, upper = state.lower[0], state.upper[0]
+    is_met = is_settled(float(lower), float(upper), tolerance)
+    status = Status.SOLVED if is_met else Status.ITERATION_LIMIT
+    mapping = np.asarray(state.best_primal[..., 0])
+    return _Solved(mapping @ np.asarray(start.policy)[experts], mapping, lower, upper, status)
+
+
+def _solve_in_program(mdp: MDP, start, experts: jax.Array, anchored, tolerance, max_iterations) -> _Solved:
+    """The map to a list of states [E] that is padded with S; without an iteration where it is nothing but padding."""
+    exists = experts < mdp.num_states
+    problem = GlobalHomomorphismProblem(
+        mdp=mdp,
+        restricted=restricted_to_list(mdp, experts),
+        pinned=anchored & (jnp.arange(mdp.num_states)[:, None] == experts),
+        exists=exists,
+    )
+    # T^E is rounded: by as much, at most, its optimal error differs from the model's.
+    rounding = mdp.probability.shape[-1] * float(jnp.finfo(mdp.dtype).eps)
+    is_any = exists.any()
+    limit = jnp.where(is_any, max_iterations, 0)
+    gap = max(tolerance - 4.0 * rounding, 0.0)
+    state = pdhg.solve(problem, pdhg.init(problem), tolerance=gap, max_iterations=limit)
+    lower = jnp.where(is_any, jnp.maximum(state.lower[0] - rounding, 0.0), jnp.inf)
+    upper = jnp.where(is_any, state.upper[0] + rounding, jnp.inf)
+    is_met = is_settled(lower, upper, tolerance) | ~is_any
+    mapping = jnp.where(exists, state.best_primal[..., 0], 0.0)
+    votes = votes_in_program.sum_of_policies(mapping, start.policy, experts)
+    return _Solved(votes, mapping, lower, upper, jnp.where(is_met, Status.SOLVED, Status.ITERATION_LIMIT))
 
 
 def _problem(mdp: MDP, experts: np.ndarray, anchored: bool) -> GlobalHomomorphismProblem:
@@ -98,7 +159,10 @@ def _problem(mdp: MDP, experts: np.ndarray, anchored: bool) -> GlobalHomomorphis
     if anchored:
         pinned[experts, np.arange(len(experts))] = True
     return GlobalHomomorphismProblem(
-        mdp=mdp, restricted=checks.to_device(restricted_model(mdp, experts)), pinned=checks.to_device(pinned)
+        mdp=mdp,
+        restricted=checks.to_device(restricted_model(mdp, experts)),
+        pinned=checks.to_device(pinned),
+        exists=checks.to_device(np.ones(len(experts), bool)),
     )
 
 

@@ -6,6 +6,7 @@ import warnings
 
 import jax.numpy as jnp
 
+from jaxhom import checks
 from jaxhom.generalization.explainers import nothing_is_looked_for
 from jaxhom.generalization.result import Generalization
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
@@ -14,6 +15,7 @@ from jaxhom.models.mdp import MDP
 from jaxhom.status import Status
 
 
+@checks.eager_where_concrete
 def uniform_elsewhere(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
     """The uniform policy over the allowed actions on every state that was not demonstrated.
 
@@ -27,7 +29,8 @@ def uniform_elsewhere(mdp: MDP, demonstrations: Demonstrations) -> Generalizatio
     Raises:
       ValueError: if a demonstration does not fit the model.
 
-    Works under jit and vmap, where values are not checked.
+    Works under jit and vmap, where values are not checked and the result does not know how it was made. Counts have no
+    derivative.
 
     Example:
       >>> import jaxhom
@@ -47,7 +50,7 @@ def uniform_elsewhere(mdp: MDP, demonstrations: Demonstrations) -> Generalizatio
         support=visited.astype(jnp.int32),
         undecided=jnp.zeros_like(visited, jnp.int32),
         status=jnp.asarray(Status.SOLVED, jnp.int32),
-        explainer=nothing_is_looked_for,
+        explainer=None if checks.is_traced(visited) else nothing_is_looked_for,
     )
 
 

@@ -2,7 +2,7 @@
 
 Algorithm 1 of Boularias and Chaib-draa 2010 grows the set s^t of states within t steps of an unvisited state s; at
 the first t at which s^t holds demonstrated states that are accepted, these vote. k-NN by steps accepts them all, k-NN
-by Euclidean distance takes the nearest.
+by Euclidean distance takes the nearest. On the host; `votes_in_program` does the same where something is traced.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ from jaxhom.models.graph import reachable_within
 from jaxhom.models.mdp import MDP
 
 _CHUNK_BYTES = 64 * 2**20  # of distances at a time
-_TIE = 1e-9  # relative difference of two distances that rounding may have made
+TIE = 1e-9  # relative difference of two distances that rounding may have made
 
 
 class Votes(NamedTuple):
@@ -75,7 +75,7 @@ def vote_of_nearest(visited, policy, coordinates: np.ndarray, accept=None) -> Vo
         votes_for = is_nearest(square)
         found.support[states] = votes_for.sum(axis=1)
         found.policy[states] = votes_for @ policy[experts] / found.support[states, None]
-        found.radius[states] = np.maximum(np.ceil(np.sqrt(square.min(axis=1)) * (1 - _TIE)), 1)
+        found.radius[states] = np.maximum(np.ceil(np.sqrt(square.min(axis=1)) * (1 - TIE)), 1)
     return found
 
 
@@ -84,9 +84,9 @@ def square_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return ((points[:, None] - others) ** 2).sum(axis=-1)
 
 
-def is_nearest(square: np.ndarray) -> np.ndarray:
+def is_nearest(square: np.ndarray, tie: float = TIE) -> np.ndarray:
     """bool [N, E]: which are at the least distance of their row, up to rounding."""
-    return square <= square.min(axis=1, keepdims=True) * (1 + _TIE)
+    return square <= square.min(axis=1, keepdims=True) * (1 + tie)
 
 
 def _no_votes(visited, policy) -> Votes:

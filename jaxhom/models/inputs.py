@@ -80,15 +80,16 @@ def check_states(mdp: MDP, states: Int[ArrayLike, " P"], name: str = "states") -
 
 
 def check_coordinates(mdp: MDP, coordinates: Float[ArrayLike, "S D"]) -> Float[np.ndarray, "S D"]:
-    """Positions of the states, in any number D of dimensions, on the host.
+    """Positions of the states, in any number D of dimensions, on the host; traced ones as they are.
 
     Raises:
       ValueError: if they are not [S, D], or one is not finite.
     """
-    coordinates = checks.as_host_array("coordinates", coordinates)
+    is_traced = checks.is_traced(coordinates)
+    coordinates = coordinates if is_traced else checks.as_host_array("coordinates", coordinates)
     good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
     checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
-    return checks.require_floats("coordinates", coordinates)
+    return coordinates if is_traced else checks.require_floats("coordinates", coordinates)
 
 
 def check_reward(mdp: MDP, reward: Num[ArrayLike, "*B S A"], policy_shape: tuple[int, ...]) -> Float[Array, "*B S A"]:

@@ -77,6 +77,7 @@ class Goal(NamedTuple):
     @classmethod
     def checked(cls, **fields) -> Goal:
         """The goal, or `ValueError` where a field is out of range."""
+        checks.refuse_traced(**fields)
         goal = cls(**fields)
         if goal.method not in METHODS:
             raise ValueError(f"method must be one of {METHODS}, got {goal.method!r}")

@@ -63,6 +63,10 @@ class ClassBook:
         """int32 [C], the number of states of each class's model."""
         return np.array(self._size, np.int32)
 
+    def known_labels(self) -> np.ndarray:
+        """int32 [S]: the classes of all states, -1 for those that were not met."""
+        return self._label.copy()
+
     def labels(self, states: np.ndarray) -> np.ndarray:
         """int32 [P]: the classes of states [P]; those that were not met before are looked at."""
         fresh = self._label[states] < 0

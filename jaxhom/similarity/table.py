@@ -18,28 +18,25 @@ from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
 from jaxhom.similarity.class_pairs import ClassPairs
 from jaxhom.similarity.classes import ClassBook
+from jaxhom.similarity.decisions import (
+    Decisions,
+    Relation,
+    decisions_of,
+    every_pair,
+    honest_status,
+    is_far,
+    is_similar,
+    require_decided,
+)
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys
 from jaxhom.solvers.lane_queue import is_settled
-from jaxhom.status import Record, Status
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Int
 
 _MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}  # below what an explanation prints
-
-
-class Decisions(Record):
-    """Which of P pairs of states are similar.
-
-    Attributes:
-      similar: bool [P].
-      status: int32 [P], a `jaxhom.Status`: SOLVED where the bounds decide, or else why they do not.
-    """
-
-    similar: np.ndarray
-    status: np.ndarray
 
 
 class SimilarityTable:
@@ -57,7 +54,8 @@ class SimilarityTable:
     Raises:
       ValueError: if the model is traced or the distance below 1.
 
-    The table grows by what it is asked; it belongs to the host and is no pytree. Outside jit, vmap and grad only.
+    The table grows by what it is asked; it belongs to the host and is no pytree. It takes concrete values alone, inside
+    jit, vmap and grad too. Completed, it answers for traced demonstrations: see `complete`.
 
     Example:
       >>> import jaxhom
@@ -72,6 +70,7 @@ class SimilarityTable:
     Source: Boularias and Chaib-draa 2010, eq. (9) and section V.
     """
 
+    @checks.eager_where_concrete
     def __init__(self, mdp: MDP, *, distance: int = 1, anchored: bool = True):
         self.mdp = as_model(mdp)
         require_concrete(self.mdp)
@@ -99,6 +98,7 @@ class SimilarityTable:
         """How many programs have been solved."""
         return self._pairs.num_solved
 
+    @checks.eager_where_concrete
     def classes(self, states: Int[ArrayLike, " P"] | None = None) -> np.ndarray:
         """int32 [P]: the class of the local model of each of the given states, all states if None.
 
@@ -108,6 +108,7 @@ class SimilarityTable:
             return self._book.labels(np.arange(self.mdp.num_states))
         return self._book.labels(check_states(self.mdp, states))
 
+    @checks.eager_where_concrete
     def brackets(
         self,
         sources: Int[ArrayLike, " P"],
@@ -128,6 +129,7 @@ class SimilarityTable:
         self._settle(pairs, goal, progress)
         return jax.tree.map(lambda leaf: leaf[where], self._widened(pairs, goal))
 
+    @checks.eager_where_concrete
     def decide(
         self,
         sources: Int[ArrayLike, " P"],
@@ -146,6 +148,7 @@ class SimilarityTable:
         options = {"mutual": mutual, "tolerance": tolerance, "progress": progress}
         return self.decisions(sources, targets, threshold, **options).similar
 
+    @checks.eager_where_concrete
     def decisions(
         self,
         sources: Int[ArrayLike, " P"],
@@ -159,25 +162,72 @@ class SimilarityTable:
         """As `decide`, and says which of the pairs that count as different could not be decided, and why."""
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
-        back = pairs[:, ::-1]
-        is_asked = ~self._is_far(back, goal) if mutual else np.ones(len(pairs), bool)
-        self._settle(pairs[is_asked], goal, progress)
-        similar, is_far = is_asked & self._is_similar(pairs, goal), self._is_far(pairs, goal)
-        status = self._known.look_up(pairs).status
         if mutual:
-            self._settle(back[similar], goal, progress)
-            is_far |= self._is_far(back, goal)
-            status = np.where(similar, self._known.look_up(back).status, status)
-            similar &= self._is_similar(back, goal)
-        return Decisions(similar=similar[where], status=_status(similar | is_far, status)[where])
+            back = pairs[:, ::-1]
+            is_asked = ~is_far(self._known.look_up(back), goal)
+            self._settle(pairs[is_asked], goal, progress)
+            self._settle(back[is_asked & is_similar(self._known.look_up(pairs), goal)], goal, progress)
+        else:
+            self._settle(pairs, goal, progress)
+        return jax.tree.map(lambda leaf: leaf[where], self._decided(pairs, goal, mutual))
 
+    @checks.eager_where_concrete
     def complete(self, threshold: float = 0.0, *, tolerance: float = 1e-4, progress: bool = False) -> SimilarityTable:
-        """Decides e <= threshold for all ordered pairs of classes of the model, and returns the table."""
+        """Decides e <= threshold for all ordered pairs of classes of the model, and returns the table.
+
+        Then `soft_local_homomorphism(..., threshold=threshold, table=table)` solves nothing any more, for whatever
+        demonstrations, and runs inside jit and vmap. A table may be completed for several thresholds, one after the
+        other.
+
+        Args:
+          threshold: epsilon >= 0.
+          tolerance: an error up to threshold + tolerance may count as similar.
+          progress: show a progress bar.
+
+        Raises:
+          ValueError: if an option is out of range, or the model has more than 4096 classes of local models.
+
+        Example:
+          >>> import jaxhom
+          >>> table = jaxhom.SimilarityTable(jaxhom.gridworld(4)).complete(threshold=0.2)
+          >>> table.relation(threshold=0.2).similar.shape
+          (9, 9)
+        """
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         self.classes()
-        self._settle(np.indices((self.num_classes,) * 2).reshape(2, -1).T, goal, progress)
+        self._settle(every_pair(self.num_classes), goal, progress)
         return self
 
+    @checks.eager_where_concrete
+    def relation(self, threshold: float = 0.0, *, mutual: bool = False, tolerance: float = 1e-4) -> Relation:
+        """Which classes are similar, as `decisions` says it of their states; of a completed table, without solving.
+
+        Args:
+          threshold: epsilon >= 0, one that the table was completed for.
+          mutual: require the error of both directions to be within the threshold.
+          tolerance: as it was when the table was completed.
+
+        Returns:
+          `Relation`.
+
+        Raises:
+          ValueError: if an option is out of range, or pairs of classes are not decided and were not tried: call
+            `complete` first.
+        """
+        goal = Goal.checked(tolerance=tolerance, threshold=threshold)
+        label = self._book.known_labels()
+        if (label < 0).any():
+            raise ValueError(
+                f"the table knows the classes of {int((label >= 0).sum())} of {len(label)} states: call "
+                f"table.complete(threshold={checks.in_one_line(threshold)}) first, outside jit, vmap and grad"
+            )
+        pairs = every_pair(self.num_classes)
+        require_decided(self._is_to_solve(pairs, goal), threshold, tolerance)
+        found = self._decided(pairs, goal, mutual)
+        square = (self.num_classes,) * 2
+        return Relation(label=label, similar=found.similar.reshape(square), status=found.status.reshape(square))
+
+    @checks.eager_where_concrete
     def maps(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> CertifiedMaps:
         """Maps M^{s,d} to M^{s',d} for pairs (s, s') of states, each with as small an error as can be certified.
 
@@ -208,7 +258,7 @@ class SimilarityTable:
         own = [self._maps[tuple(pair)] for pair in pairs.tolist()]
         upper = np.array([found.upper[0] for _, found in own], self.mdp.dtype) + self._pairs.slack(pairs)
         known = self._widened(pairs, goal).replace(upper=upper)
-        bounds = known.replace(status=_status(goal.is_met(known.lower, upper), known.status))
+        bounds = known.replace(status=honest_status(goal.is_met(known.lower, upper), known.status))
         return carry_maps(
             self._maker,
             (sources, targets),
@@ -227,24 +277,27 @@ class SimilarityTable:
 
     def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool) -> None:
         """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before."""
-        known = self._known.look_up(pairs)
-        tolerance = self._pairs.tolerance(goal, self._pairs.slack(pairs))
-        is_open = ~is_settled(known.lower, known.upper, tolerance, goal.threshold)
-        pairs = pairs[is_open & ~self._known.was_tried(pairs, goal)]
+        pairs = pairs[self._is_to_solve(pairs, goal)]
         if len(pairs):
             self._known.add(pairs, self._pairs.brackets(pairs, goal, progress=progress), goal)
 
-    def _is_similar(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
-        return self._known.look_up(pairs).upper <= goal.threshold + goal.tolerance
+    def _is_to_solve(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
+        """bool [Q]: whether pairs of classes are open, and were not tried before."""
+        known = self._known.look_up(pairs)
+        tolerance = self._pairs.tolerance(goal, self._pairs.slack(pairs))
+        is_open = ~is_settled(known.lower, known.upper, tolerance, goal.threshold)
+        return is_open & ~self._known.was_tried(pairs, goal)
 
-    def _is_far(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
-        return (self._known.look_up(pairs).lower > goal.threshold) & ~self._is_similar(pairs, goal)
+    def _decided(self, pairs: np.ndarray, goal: Goal, mutual: bool) -> Decisions:
+        """What is known of pairs of classes [Q, 2], in both directions if `mutual`."""
+        back = self._known.look_up(pairs[:, ::-1]) if mutual else None
+        return decisions_of(self._known.look_up(pairs), goal, back)
 
     def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""
         known, slack = self._known.look_up(pairs), self._pairs.slack(pairs)
         lower, upper = np.maximum(known.lower - slack, 0), known.upper + slack
-        return known.replace(lower=lower, upper=upper, status=_status(goal.is_met(lower, upper), known.status))
+        return known.replace(lower=lower, upper=upper, status=honest_status(goal.is_met(lower, upper), known.status))
 
     def _pairs_of(self, sources: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The different pairs of classes [Q, 2] of pairs of states, and which of them each is, [P]."""
@@ -279,17 +332,15 @@ def table_for(table: SimilarityTable | None, mdp: MDP, distance: int, anchored: 
 
 
 def _same_transitions(one: MDP, other: MDP) -> bool:
-    """Whether two models have the same local models: features, discount and initial distribution may differ."""
+    """Whether two models have the same local models: features, discount and initial distribution may differ.
+
+    Of traced arrays shapes and types are all that can be compared.
+    """
 
     def parts(mdp):
         return mdp.next_state, mdp.probability, mdp.allowed
 
     return one is other or all(
-        a is b or (a.shape == b.shape and a.dtype == b.dtype and np.array_equal(a, b))
+        a is b or (a.shape == b.shape and a.dtype == b.dtype and (checks.is_traced(a, b) or np.array_equal(a, b)))
         for a, b in zip(parts(one), parts(other), strict=True)
     )
-
-
-def _status(is_met: np.ndarray, status: np.ndarray) -> np.ndarray:
-    """The status of bounds that are wider than they were found; where that keeps them open, rounding is to blame."""
-    return np.where(is_met, Status.SOLVED, np.where(status == Status.SOLVED, Status.STALLED, status)).astype(np.int32)

@@ -1,0 +1,230 @@
+"""Who votes, inside jit and vmap: the searches of `votes` where demonstrations, or anything else, are traced.
+
+The demonstrated states are a list of static length E, as many as there are steps, padded with S. Sets of them are kept
+as bits: 32 to a word, W = ceil(E / 32) words for each state. The set s^t of Algorithm 1 grows by one sweep, which takes
+the union of the sets of a state's successors; the accepted ones among those that joined vote. A sweep costs as many
+operations on words as there are edges, times W, and nothing of size [S, E] is made before the votes are counted.
+
+Which sets are similar is looked up by class: `Relation` says it for the classes of a completed table.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.generalization import evidence
+from jaxhom.generalization.result import Generalization
+from jaxhom.generalization.votes import TIE, Votes, is_nearest, square_distances
+from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.graph import host_graph
+from jaxhom.models.mdp import MDP
+from jaxhom.models.padded_rows import narrow_width
+from jaxhom.similarity.decisions import Relation
+from jaxhom.status import Status
+
+_UNROLL = 2  # successors whose sets are united in one pass; XLA repeats a union without a loop in all that reads it
+
+
+class Found(NamedTuple):
+    """What a search found: the votes, and `undecided` [S] and `status` as in `Generalization`."""
+
+    votes: Votes
+    undecided: jax.Array
+    status: jax.Array
+
+
+class _Search(NamedTuple):
+    """The search after t steps. Sets of demonstrated states are words [S, W]; the rest is [S].
+
+    Attributes:
+      within: who lies within t steps.
+      asked: who lay within as many steps as the state has waited.
+      voters: who votes; empty while the state waits.
+      is_waiting: whether a state asks and nobody was accepted yet.
+      radius: for how many steps it has waited.
+    """
+
+    steps: jax.Array
+    is_growing: jax.Array
+    within: jax.Array
+    asked: jax.Array
+    voters: jax.Array
+    is_waiting: jax.Array
+    radius: jax.Array
+
+
+def padded_experts(mdp: MDP, demonstrations: Demonstrations, visited) -> jax.Array:
+    """int32 [E]: the demonstrated states that decide, ascending, then S; E is all states or all steps, if fewer."""
+    length = min(mdp.num_states, demonstrations.states.size)
+    decides = evidence.deciding(mdp, visited)
+    return jnp.nonzero(decides, size=length, fill_value=mdp.num_states)[0].astype(jnp.int32)
+
+
+def vote_of_rings(mdp: MDP, start: Generalization, experts, asking, relation: Relation | None = None) -> Found:
+    """As `votes.vote_of_rings`: the nearest demonstrated states that may vote and are similar; all that may if None.
+
+    Args:
+      mdp: the model.
+      start: the demonstrated states and the expert's policy.
+      experts: from `padded_experts`.
+      asking: bool [S], the states to ask for, none of them demonstrated.
+      relation: which classes are similar; concrete.
+    """
+    may_vote = _may_vote(mdp, start, experts)
+    accepted = may_vote if relation is None else may_vote & _by_class(relation, relation.similar, experts)
+    search = _grow(mdp, experts, accepted, asking)
+    is_voter = _unpacked(search.voters, len(experts))
+    votes = Votes(
+        policy=evidence.policy_of_votes(mdp, sum_of_policies(is_voter, start.policy, experts))[0],
+        radius=jnp.where(search.is_waiting, -1, search.radius),
+        support=_count(search.voters),
+    )
+    undecided, status = jnp.zeros(mdp.num_states, jnp.int32), jnp.asarray(Status.SOLVED, jnp.int32)
+    if relation is not None:
+        for reason in (Status.ITERATION_LIMIT, Status.STALLED):
+            count = _count(search.asked & may_vote & _by_class(relation, relation.status == reason, experts))
+            undecided += count
+            status = jnp.where(count.any(), jnp.int32(reason), status)
+    return Found(votes, undecided, status)
+
+
+def vote_of_nearest(mdp: MDP, start: Generalization, experts, coordinates) -> Votes:
+    """As `votes.vote_of_nearest`: the demonstrated states at the least distance in `coordinates` [S, D]."""
+    everyone, chosen = jnp.arange(mdp.num_states)[:, None], _clipped(mdp, experts)
+    counts = evidence.has_vote(mdp, start.policy, everyone, chosen) & (experts < mdp.num_states)
+    square = jnp.where(counts, square_distances(coordinates, coordinates[chosen]), jnp.inf)
+    least = square.min(axis=1)
+    tie = TIE + _rounding(coordinates, least)
+    is_voter = is_nearest(square, tie[:, None]) & jnp.isfinite(least)[:, None]
+    radius = jnp.maximum(jnp.ceil(jnp.sqrt(least) * (1 - tie)), 1)
+    return Votes(
+        policy=evidence.policy_of_votes(mdp, sum_of_policies(is_voter, start.policy, experts))[0],
+        radius=jnp.where(is_voter.any(axis=1), radius, -1).astype(jnp.int32),
+        support=is_voter.sum(axis=1, dtype=jnp.int32),
+    )
+
+
+def sum_of_policies(weights, policy, experts) -> jax.Array:
+    """[S, A]: the sum of the demonstrated states' policies with weights [S, E]; booleans are 0 and 1."""
+    policies = policy.at[experts].get(mode="fill", fill_value=0)
+    return jnp.matmul(weights.astype(policy.dtype), policies, precision=jax.lax.Precision.HIGHEST)
+
+
+def _rounding(coordinates, least) -> jax.Array:
+    """[S]: the relative difference of two squares near the `least` that rounded coordinates [S, D] may have made."""
+    limits = jnp.finfo(coordinates.dtype)
+    difference = jnp.abs(coordinates).max() * coordinates.shape[1] ** 0.5 * limits.eps
+    return 4 * (limits.eps + difference / jnp.sqrt(jnp.maximum(least, limits.tiny)))
+
+
+def _grow(mdp: MDP, experts, accepted, asking) -> _Search:
+    """Grows the sets until no state waits or no set grows, which is after S steps at the latest."""
+    successors = _successors(mdp)
+
+    def step(search: _Search) -> _Search:
+        grown = _united(search.within, successors)
+        waits = search.is_waiting[:, None]
+        voters = jnp.where(waits, grown & ~search.within & accepted, search.voters)
+        is_waiting = search.is_waiting & ~(voters > 0).any(axis=1)
+        return _Search(
+            steps=search.steps + 1,
+            is_growing=(grown != search.within).any() & is_waiting.any(),
+            within=grown,
+            asked=jnp.where(waits, grown, search.asked),
+            voters=voters,
+            is_waiting=is_waiting,
+            radius=search.radius + search.is_waiting,
+        )
+
+    within = _packed(jnp.arange(mdp.num_states)[:, None] == experts)
+    start = _Search(
+        steps=jnp.int32(0),
+        is_growing=asking.any(),
+        within=within,
+        asked=within,
+        voters=within & ~within,  # empty: sets of the states that ask are, at first
+        is_waiting=asking,
+        radius=jnp.where(asking, 0, -1).astype(jnp.int32),
+    )
+    return jax.lax.while_loop(lambda search: search.is_growing & (search.steps < mdp.num_states), step, start)
+
+
+def _successors(mdp: MDP) -> list[tuple[jax.Array | np.ndarray, jax.Array | np.ndarray]]:
+    """Blocks of states, [R], and what each of these leads to, [R, D], padded with the state itself.
+
+    Where the graph is concrete there are two: all states with no more successors than most of them have, and the few
+    others with all of theirs.
+    """
+    if checks.is_traced(mdp.next_state, mdp.probability, mdp.allowed):
+        everyone = jnp.arange(mdp.num_states)
+        led_to = jnp.where(mdp.probability > 0, mdp.next_state, everyone[:, None, None])
+        return [(everyone, led_to.reshape(mdp.num_states, -1))]
+    adjacency = host_graph(mdp).adjacency
+    counts = np.diff(adjacency.indptr)
+    width = narrow_width(counts)
+    blocks = [(np.arange(mdp.num_states), width), (np.flatnonzero(counts > width), int(counts.max()))]
+    return [(states, _padded_rows(adjacency, states, width)) for states, width in blocks if len(states)]
+
+
+def _padded_rows(adjacency, states: np.ndarray, width: int) -> np.ndarray:
+    """The first `width` successors of the given states, padded with the state itself."""
+    place = adjacency.indptr[states][:, None] + np.arange(width)
+    is_inside = place < adjacency.indptr[states + 1][:, None]
+    return np.where(is_inside, adjacency.indices[np.where(is_inside, place, 0)], states[:, None])
+
+
+def _united(sets, successors) -> jax.Array:
+    """Words [S, W]: each state's set and those of its successors."""
+    for states, led_to in successors:
+
+        def add(union, column):
+            return union | sets[column], None
+
+        union, _ = jax.lax.scan(add, sets[states], jnp.asarray(led_to.T), unroll=_UNROLL)
+        united = union if len(states) == len(sets) else united.at[states].set(union)
+    return united
+
+
+def _may_vote(mdp: MDP, start: Generalization, experts) -> jax.Array:
+    """Words [S, W]: the demonstrated states that take actions which the state has; one row where all have all."""
+    states = np.arange(mdp.num_states if mdp.restricts_actions else 1)[:, None]
+    return _packed(evidence.has_vote(mdp, start.policy, states, _clipped(mdp, experts)))
+
+
+def _by_class(relation: Relation, holds: np.ndarray, experts) -> jax.Array:
+    """Words [S, W]: the demonstrated states of whose class `holds` [C, C] says so beside the class of the state."""
+    label = jnp.asarray(relation.label)
+    columns = jnp.asarray(holds)[:, label.at[experts].get(mode="clip")]
+    return _packed(columns)[label]  # by class, before there are as many rows as states
+
+
+def _clipped(mdp: MDP, experts) -> jax.Array:
+    """The list with some state in place of the padding."""
+    return jnp.minimum(experts, mdp.num_states - 1)
+
+
+def _packed(sets) -> jax.Array:
+    """bool [R, E] as words [R, W]; bit b of word w is column b W + w, so that words lie side by side."""
+    rows, columns = np.shape(sets)
+    words = -(-columns // 32)
+    bits = jnp.pad(sets, ((0, 0), (0, 32 * words - columns))).reshape(rows, 32, words)
+    return (bits.astype(jnp.uint32) << _SHIFTS).sum(axis=1, dtype=jnp.uint32)
+
+
+def _unpacked(words, columns: int) -> jax.Array:
+    """Words [R, W] as bool [R, E]."""
+    bits = (words[:, None] >> _SHIFTS) & 1
+    return bits.reshape(len(words), -1)[:, :columns].astype(bool)
+
+
+def _count(words) -> jax.Array:
+    """int32 [R]: how many there are in each set."""
+    return jax.lax.population_count(words).sum(axis=1, dtype=jnp.int32)
+
+
+_SHIFTS = np.arange(32, dtype=np.uint32)[:, None]

@@ -69,13 +69,14 @@ def _grid() -> Callable[[Any], dict]:
 def _racetrack() -> Callable[[Any], dict]:
     """Section VI.B: 5 demonstrations of at most 100 steps, Algorithm 1, and its policy's value. No LPAL."""
     track = jaxhom.racetrack("a")
-    expert = jaxhom.optimal_policy(track.mdp, track.reward).policy
+    reward = track.mdp.features @ track.weights
+    expert = jaxhom.optimal_policy(track.mdp, reward).policy
     table = jaxhom.SimilarityTable(track.mdp).complete()
 
     def path(key):
         walks = jaxhom.sample_demonstrations(key, track.mdp, expert, 5, 100, terminal=track.terminal)
         general = jaxhom.soft_local_homomorphism(track.mdp, walks, table=table)
-        value = jaxhom.policy_value(track.mdp, general.policy, track.reward) @ track.mdp.initial
+        value = jaxhom.policy_value(track.mdp, general.policy, reward) @ track.mdp.initial
         return {"radius": general.radius, "value": value, "lower": value, "upper": value, "status": general.status}
 
     return path

@@ -1,10 +1,12 @@
-"""Pairs over several devices: eight, forced on the host by a flag that must be set before JAX starts."""
+"""Work over several devices, forced on the host by a flag that must be set before JAX starts."""
 
 import os
 import subprocess
 import sys
 
-PROGRAM = """
+import numpy as np
+
+PAIRS = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
@@ -18,19 +20,52 @@ assert (found.upper - found.lower).max() <= 1e-5
 np.save({path!r}, np.stack([found.lower, found.upper]))
 """
 
+PATHS = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+import jaxhom
 
-def run(path, devices):
+assert jax.device_count() == {devices}
+mdp = jaxhom.gridworld(6, num_regions=9, discount=0.9).mdp
+expert = jaxhom.optimal_policy(mdp, mdp.features[..., 8]).policy
+table = jaxhom.SimilarityTable(mdp).complete()
+
+def path(key):
+    walks = jaxhom.sample_demonstrations(key, mdp, expert, 2, 8)
+    general = jaxhom.soft_local_homomorphism(mdp, walks, table=table)
+    vhat = jaxhom.feature_expectations(mdp, general.policy)
+    learned = jaxhom.lpal(mdp, vhat, initial_policy=general.policy)
+    return general.radius, learned.margin, learned.margin_bound
+
+mesh = jax.sharding.Mesh(np.array(jax.devices()), ("draws",))
+spec = jax.sharding.PartitionSpec("draws")
+run = jax.jit(jax.shard_map(jax.vmap(path), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+radius, lower, upper = run(jax.random.split(jax.random.key(0), 6))
+assert (upper - lower).max() <= 1e-3
+np.save({path!r}, np.concatenate([radius.T, lower[None], upper[None]]))
+"""
+
+
+def run(program, path, devices):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     environment = {**os.environ, "XLA_FLAGS": flags}
-    program = PROGRAM.format(devices=devices, path=str(path))
+    program = program.format(devices=devices, path=str(path))
     subprocess.run([sys.executable, "-c", program], check=True, env=environment, timeout=240)
 
 
 def test_eight_devices_agree_with_one(tmp_path):
-    import numpy as np
-
     for devices in (1, 8):
-        run(tmp_path / f"{devices}.npy", devices)
+        run(PAIRS, tmp_path / f"{devices}.npy", devices)
     one, eight = (np.load(tmp_path / f"{devices}.npy") for devices in (1, 8))
     np.testing.assert_allclose(one, eight, atol=2e-5)
     assert (np.maximum(one[0], eight[0]) <= np.minimum(one[1], eight[1]) + 1e-12).all()
+
+
+def test_paths_over_two_devices_are_those_of_one(tmp_path):
+    """The same votes draw by draw, and margins within each other's certificates."""
+    for devices in (1, 2):
+        run(PATHS, tmp_path / f"{devices}.npy", devices)
+    one, two = (np.load(tmp_path / f"{devices}.npy") for devices in (1, 2))
+    np.testing.assert_array_equal(one[:-2], two[:-2])
+    assert (np.maximum(one[-2], two[-2]) <= np.minimum(one[-1], two[-1]) + 1e-12).all()

@@ -153,6 +153,13 @@ class SuccessorLists(Dynamics):
         """The slots that hold a successor: others are not searched for again."""
         return np.asarray(self.probability) > 0
 
+    def listed_slots(self) -> Bool[np.ndarray, "S A N"]:
+        """The slots that held a successor when the lists were made, whatever `probability` has been exchanged for."""
+        entries = np.append(self.predecessors.narrow, self.predecessors.wide)
+        listed = np.zeros(self.next_state.size + 1, bool)  # the last one is the sentinel's
+        listed[entries] = True
+        return listed[:-1].reshape(self.next_state.shape)
+
     def _narrow_rows(self, value) -> tuple[Int[Array, "S A W"], Float[Array, "S A W"], Float[Array, "S+J *B"]]:
         """Indices and weights, and the values that they read: E[value(s') | s, a] is their `gather_sum`."""
         width, (num_states, _, slots) = self.narrow_width, self.next_state.shape

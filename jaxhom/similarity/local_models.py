@@ -171,7 +171,9 @@ def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int
     if graph.refused is not None:
         labels = np.zeros((count, width, num_actions, 1), graph.dtype)
         labels[model, local, :, 0] = graph.refused[rows.indices]
-    return LocalModels(members=members, size=np.diff(rows.indptr).astype(np.int32), transition=transition, labels=labels)
+    return LocalModels(
+        members=members, size=np.diff(rows.indptr).astype(np.int32), transition=transition, labels=labels
+    )
 
 
 def _numbered(states, rows: scipy.sparse.csr_array, width: int):

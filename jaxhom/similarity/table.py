@@ -279,14 +279,17 @@ def table_for(table: SimilarityTable | None, mdp: MDP, distance: int, anchored: 
 
 
 def _same_transitions(one: MDP, other: MDP) -> bool:
-    """Whether two models have the same local models: features, discount and initial distribution may differ."""
+    """Whether a concrete model has the local models of another, as far as that is concrete too.
+
+    Features, discount and initial distribution may differ.
+    """
 
     def parts(mdp):
         return mdp.next_state, mdp.probability, mdp.allowed
 
     return one is other or all(
-        a is b or (a.shape == b.shape and a.dtype == b.dtype and np.array_equal(a, b))
-        for a, b in zip(parts(one), parts(other), strict=True)
+        a is b or (a.shape == b.shape and a.dtype == b.dtype and (checks.is_traced(a) or np.array_equal(a, b)))
+        for a, b in zip(parts(other), parts(one), strict=True)
     )
 
 

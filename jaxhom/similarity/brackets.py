@@ -37,7 +37,7 @@ _FEW_LANES = 16  # a handful of pairs is one narrow batch: a step costs what its
 _FEW_PDHG_LANES = 8  # the same for PDHG
 _FEW_BYTES = 2**19  # more than that in a batch of a few pairs' lanes is repeated work worth a program of its own
 _SMALL_ROUNDING = 0.125  # of the tolerance: nothing is done about it
-_NOISE = 32.0  # times eps: closer than that an iteration does not come
+NOISE = 32.0  # times eps: closer than that an iteration does not come
 _INTERIOR_BYTES = 2 * 2**20  # of a batch's normal matrices: a core's own cache
 _TIGHT = 1e-3  # wider gaps PDHG closes sooner
 _MAP_LANES = 8  # maps are asked for a few at a time
@@ -250,8 +250,8 @@ def _settle_by_pdhg(
     is_narrow = rounding > _SMALL_ROUNDING * goal.tolerance
     gap, limit = goal.tolerance, goal.threshold
     if is_narrow:  # ask for what the bounds would be without their widening, with room for the noise in them
-        gap = max(0.5 * goal.tolerance, _NOISE * eps) + rounding
-        limit = goal.threshold - of_lower + _NOISE * eps
+        gap = max(0.5 * goal.tolerance, NOISE * eps) + rounding
+        limit = goal.threshold - of_lower + NOISE * eps
     points = ("best_primal", "best_dual") if is_narrow else ()
     found = solve_many(
         pdhg.SOLVER,

@@ -21,6 +21,7 @@ from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
 _MAX_ENTRIES = 2**24  # of a transition tensor: 128 MB in float64
+_MAX_INDICES = 2**26  # of local models inside programs: 256 MB
 
 
 class LocalModels(Record):
@@ -59,6 +60,51 @@ def local_models(mdp: MDP, states, distance: int = 1) -> LocalModels:
     maker = LocalModelMaker(host_graph(mdp), distance)
     members = maker.members(states)
     return maker.make(states, int(np.diff(members.indptr).max(initial=1)), members)
+
+
+class LocalIndices(Record):
+    """Where the numbers of P local models are found among a model's: what programs read instead of a graph.
+
+    Attributes:
+      members: int32 [P, n], as in `LocalModels`.
+      size: int32 [P], likewise.
+      successor: int32 [P, n, A, N], the number in the local model of the state that each slot of each member leads to,
+        its own where that is no member; n where the slot has no successor.
+    """
+
+    members: np.ndarray
+    size: np.ndarray
+    successor: np.ndarray
+
+
+def local_indices(graph: HostGraph, next_state: np.ndarray, is_open: np.ndarray, states, distance: int) -> LocalIndices:
+    """Indices of M^{s,d} for each of the given states.
+
+    Args:
+      graph: with the open slots as its transitions.
+      next_state: int [S, A, N].
+      is_open: bool [S, A, N], the slots that hold a successor.
+      states: int [P].
+      distance: d >= 1.
+
+    Raises:
+      ValueError: if they are more than 2^26.
+    """
+    rows = graph.reach(states, distance)
+    sizes = np.diff(rows.indptr)
+    width, (_, num_actions, slots) = int(sizes.max(initial=1)), next_state.shape
+    if len(states) * width * num_actions * slots > _MAX_INDICES:
+        raise ValueError(
+            f"{len(states)} local models of up to {width} states with {num_actions} actions and {slots} successors have "
+            f"{len(states)} x {width} x {num_actions} x {slots} indices, more than 2^26: ask for fewer states at a time, "
+            "concrete ones, or for a smaller distance"
+        )
+    members, model, local, position = _numbered(states, rows, width)
+    own = local[:, None, None]
+    successor = np.full((*members.shape, num_actions, slots), width, np.int32)
+    found = position(model[:, None, None], next_state[rows.indices], own)
+    successor[model, local] = np.where(is_open[rows.indices], found, width)
+    return LocalIndices(members=members, size=sizes.astype(np.int32), successor=successor)
 
 
 class LocalModelMaker:
@@ -113,20 +159,9 @@ def validated_states(mdp: MDP, states, distance: int) -> np.ndarray:
 def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int) -> LocalModels:
     """Local models of `states`, whose members are the rows of a boolean matrix, padded to `width` states."""
     count, num_states, num_actions = len(states), graph.num_states, graph.num_actions
-    sizes = np.diff(rows.indptr)
-    model = np.repeat(np.arange(count, dtype=np.int64), sizes)
-    key = model * num_states + rows.indices  # ascending: rows are sorted
-    is_centre = rows.indices == states[model]
-    position = np.arange(len(key)) - np.repeat(rows.indptr[:-1], sizes)
-    centre_position = position[is_centre][model]
-    local = np.where(is_centre, 0, position + (position < centre_position))
-    members = np.full((count, width), -1, np.int32)
-    members[model, local] = rows.indices
-
+    members, model, local, position = _numbered(states, rows, width)
     owner, entry = graph.entries_of(rows.indices)
-    wanted = model[owner] * num_states + graph.successor[entry]
-    found = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-    target = np.where(key[found] == wanted, local[found], local[owner])
+    target = position(model[owner], graph.successor[entry], local[owner])
     row = (model[owner] * width + local[owner]) * num_actions + graph.action[entry]
     shape = (count, width, num_actions, width)
     weight = graph.probability[entry].astype(np.float64)
@@ -136,4 +171,30 @@ def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int
     if graph.refused is not None:
         labels = np.zeros((count, width, num_actions, 1), graph.dtype)
         labels[model, local, :, 0] = graph.refused[rows.indices]
-    return LocalModels(members=members, size=sizes.astype(np.int32), transition=transition, labels=labels)
+    return LocalModels(
+        members=members, size=np.diff(rows.indptr).astype(np.int32), transition=transition, labels=labels
+    )
+
+
+def _numbered(states, rows: scipy.sparse.csr_array, width: int):
+    """The members of local models, int32 [P, width]; of each, the model and its number there; and `position`.
+
+    `position(model, state, otherwise)` looks up numbers of states in models, `otherwise` where a state is no member.
+    """
+    count, num_states = rows.shape
+    sizes = np.diff(rows.indptr)
+    model = np.repeat(np.arange(count, dtype=np.int64), sizes)
+    key = model * num_states + rows.indices  # ascending: rows are sorted
+    is_centre = rows.indices == states[model]
+    place = np.arange(len(key)) - np.repeat(rows.indptr[:-1], sizes)
+    centre_place = place[is_centre][model]
+    local = np.where(is_centre, 0, place + (place < centre_place))
+    members = np.full((count, width), -1, np.int32)
+    members[model, local] = rows.indices
+
+    def position(model, state, otherwise):
+        wanted = model * num_states + state
+        found = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+        return np.where(key[found] == wanted, local[found], otherwise)
+
+    return members, model, local, position

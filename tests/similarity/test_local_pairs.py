@@ -8,7 +8,6 @@ import functools
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
@@ -385,11 +384,3 @@ def test_an_unknown_method_is_refused():
 def test_a_negative_threshold_is_refused(threshold):
     with pytest.raises(ValueError, match=f"threshold must not be negative, got {threshold}"):
         locally_similar(model_of("blocks")[0], [0], [1], threshold)
-
-
-def test_traced_input_is_refused():
-    mdp, _ = model_of("blocks")
-    with pytest.raises(ValueError, match="outside jit"):
-        jax.jit(lambda mdp: local_similarity(mdp, [0], [1]))(mdp)
-    with pytest.raises(ValueError, match="sources is a traced value"):
-        jax.jit(lambda s: locally_similar(mdp, s, [1]))(jnp.array([0]))

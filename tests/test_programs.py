@@ -107,14 +107,14 @@ def cases() -> dict[str, Case]:
         "local_similarity": Case(
             lambda sources: jaxhom.local_similarity(mdp, sources, pairs[1]),
             pairs[0],
-            by_probability(lambda mdp: jaxhom.local_similarity(mdp, *pairs).upper),
+            by_probability(lambda mdp: jaxhom.local_similarity(mdp, *pairs, table=table).upper),
             jnp.zeros_like(mdp.probability),
             lambda found: found if isinstance(found, jax.Array) else (found.lower, found.upper),
         ),
         "locally_similar": Case(
             lambda sources: jaxhom.locally_similar(mdp, sources, pairs[1], 0.1),
             pairs[0],
-            by_probability(lambda mdp: jaxhom.locally_similar(mdp, *pairs, 0.1).astype(float)),
+            by_probability(lambda mdp: jaxhom.locally_similar(mdp, *pairs, 0.1, table=table).astype(float)),
             jnp.zeros_like(mdp.probability),
         ),
         "homomorphism_error": Case(lambda source: jaxhom.homomorphism_error(source, models[1]), models[0]),

@@ -21,7 +21,8 @@ from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity.table import SimilarityTable, table_for
+from jaxhom.similarity.given_table import table_for
+from jaxhom.similarity.table import SimilarityTable
 from jaxhom.status import Status
 
 if TYPE_CHECKING:

@@ -95,9 +95,9 @@ def local_indices(graph: HostGraph, next_state: np.ndarray, is_open: np.ndarray,
     width, (_, num_actions, slots) = int(sizes.max(initial=1)), next_state.shape
     if len(states) * width * num_actions * slots > _MAX_INDICES:
         raise ValueError(
-            f"{len(states)} local models of up to {width} states with {num_actions} actions and {slots} successors have "
-            f"{len(states)} x {width} x {num_actions} x {slots} indices, more than 2^26: ask for fewer states at a time, "
-            "concrete ones, or for a smaller distance"
+            f"{len(states)} local models of up to {width} states with {num_actions} actions and {slots} successors "
+            f"have {len(states)} x {width} x {num_actions} x {slots} indices, more than 2^26: ask for fewer states at "
+            "a time, concrete ones, or for a smaller distance"
         )
     members, model, local, position = _numbered(states, rows, width)
     own = local[:, None, None]
@@ -158,7 +158,7 @@ def validated_states(mdp: MDP, states, distance: int) -> np.ndarray:
 
 def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int) -> LocalModels:
     """Local models of `states`, whose members are the rows of a boolean matrix, padded to `width` states."""
-    count, num_states, num_actions = len(states), graph.num_states, graph.num_actions
+    count, num_actions = len(states), graph.num_actions
     members, model, local, position = _numbered(states, rows, width)
     owner, entry = graph.entries_of(rows.indices)
     target = position(model[owner], graph.successor[entry], local[owner])

@@ -23,8 +23,9 @@ from jaxhom import checks
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom.similarity.given_table import table_for
 from jaxhom.similarity.pairs_in_programs import brackets_in_program
-from jaxhom.similarity.table import SimilarityTable, table_for
+from jaxhom.similarity.table import SimilarityTable
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Int

@@ -59,7 +59,7 @@ class Generalization(Record):
 
         For Algorithm 1 that is which demonstrated states voted, at what radius, through which map from the state's
         local model to theirs, and between which certified bounds the error of such a map lies; or that nothing was
-        found. Maps are computed on demand: the first call for models of a new size compiles for a few seconds.
+        found. Maps are computed on demand.
 
         Args:
           state: its number.

@@ -5,6 +5,8 @@ by the rounding of sums that grow with the models. The points prove more than th
 feasible, evaluates their products in float64 and rounds outwards. `homomorphism_lp` has the notation.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
@@ -24,33 +26,63 @@ def certified_bounds(problem: HomomorphismProblem, f: np.ndarray, y: np.ndarray)
     lower, upper = np.zeros(count, f.dtype), np.zeros(count, f.dtype)
     for start in range(0, count, chunk):
         part = slice(start, start + chunk)
-        lower[part], upper[part] = _bounds(problem, part, _lanes_first(f[..., part]), _lanes_first(y[..., part]))
+        points = _lanes_first(f[..., part]), _lanes_first(y[..., part])
+        lower[part], upper[part] = Certificate(problem, part).bounds(*points)
     return lower, upper
 
 
-def _bounds(problem: HomomorphismProblem, part: slice, f, y) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of some lanes; f [P, n, m] and y [P, n, A, m + L] in float64."""
-    rows = np.arange(f.shape[1]) < problem.source_size[part, None]
-    columns = np.arange(f.shape[2]) < problem.target_size[part, None]
-    f = np.where(rows[:, :, None] & columns[:, None], np.maximum(f, 0.0), 0.0)
-    f /= np.where(rows, f.sum(axis=2), 1.0)[:, :, None]
-    if problem.anchored:
-        f[:, 0] = np.eye(f.shape[2])[0]
-    y = y / np.maximum(np.abs(y).sum(axis=(1, 2, 3)), 1.0)[:, None, None, None]
-    labels = (problem.source_labels, problem.target_labels)
-    models = [None if a is None else _lanes_first(a[..., part]) for a in (problem.source, problem.target, *labels)]
-    error, largest = np.abs(forward(*models, f)).max(axis=(1, 2, 3)), _largest(*models[2:])
-    slopes = np.where(columns[:, None], adjoint(*models, y), np.inf)
-    lowest = slopes.min(axis=2)
-    if problem.anchored:
-        lowest[:, 0] = slopes[:, 0, 0]
-    value = np.where(rows, lowest, 0.0).sum(axis=1)
-    (_, n, num_actions, columns), m = y.shape, f.shape[2]
-    terms = num_actions * (n + 2 * columns) + 2 * n + 2 * m + 8  # as in `HomomorphismProblem.rounding`, with room
-    rounding = terms * np.finfo(np.float64).eps * largest
-    outward = np.finfo(problem.source.dtype).eps  # of the conversion to the dtype of the models
-    upper = (error + rounding) * (1.0 + outward)
-    return np.maximum(value - rounding, 0.0) * (1.0 - outward), upper
+class Certificate:
+    """What points prove of some lanes of a problem.
+
+    Args:
+      problem: NumPy arrays, lanes last.
+      lanes: which ones.
+
+    Attributes:
+      models: T, T', l and l' of the lanes, these first, in float64; the last two None without labels.
+      dtype: of the problem's models.
+    """
+
+    def __init__(self, problem: HomomorphismProblem, lanes: slice):
+        arrays = (problem.source, problem.target, problem.source_labels, problem.target_labels)
+        self.models = tuple(None if a is None else _lanes_first(a[..., lanes]) for a in arrays)
+        self.dtype, self._anchored = problem.source.dtype, problem.anchored
+        self._rows = np.arange(self.models[0].shape[1]) < problem.source_size[lanes, None]
+        self._columns = np.arange(self.models[1].shape[1]) < problem.target_size[lanes, None]
+        self._largest = np.broadcast_to(_largest(*self.models[2:]), len(self._rows))
+
+    def part(self, index) -> Certificate:
+        """That of some of the lanes."""
+        new = object.__new__(Certificate)
+        new.models = tuple(None if leaf is None else leaf[index] for leaf in self.models)
+        new.dtype, new._anchored = self.dtype, self._anchored
+        new._rows, new._columns, new._largest = self._rows[index], self._columns[index], self._largest[index]
+        return new
+
+    def feasible(self, f: np.ndarray) -> np.ndarray:
+        """The maps [P, n, m] that points f nearly are."""
+        f = np.where(self._rows[:, :, None] & self._columns[:, None], np.maximum(f, 0.0), 0.0)
+        f /= np.where(self._rows, f.sum(axis=2), 1.0)[:, :, None]
+        if self._anchored:
+            f[:, 0] = np.eye(f.shape[2])[0]
+        return f
+
+    def bounds(self, f: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds [P], from f [P, n, m], nearly maps, and y [P, n, A, m + L], any; float64."""
+        rows, columns, f = self._rows, self._columns, self.feasible(f)
+        y = y / np.maximum(np.abs(y).sum(axis=(1, 2, 3)), 1.0)[:, None, None, None]
+        error = np.abs(forward(*self.models, f)).max(axis=(1, 2, 3))
+        slopes = np.where(columns[:, None], adjoint(*self.models, y), np.inf)
+        lowest = slopes.min(axis=2)
+        if self._anchored:
+            lowest[:, 0] = slopes[:, 0, 0]
+        value = np.where(rows, lowest, 0.0).sum(axis=1)
+        (_, n, num_actions, width), m = y.shape, f.shape[2]
+        terms = num_actions * (n + 2 * width) + 2 * n + 2 * m + 8  # as in `HomomorphismProblem.rounding`, with room
+        rounding = terms * np.finfo(np.float64).eps * self._largest
+        outward = np.finfo(self.dtype).eps  # of the conversion to the dtype of the models
+        upper = (error + rounding) * (1.0 + outward)
+        return np.maximum(value - rounding, 0.0) * (1.0 - outward), upper
 
 
 def forward(source, target, source_labels, target_labels, f) -> np.ndarray:

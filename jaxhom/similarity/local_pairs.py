@@ -55,7 +55,8 @@ def local_similarity(
       anchored: require that the centre is mapped to the centre; False is the program as printed.
       tolerance: largest upper - lower to settle for.
       method: "pdhg"; "interior_point", for tight brackets of small models on a CPU (whatever it leaves open, PDHG
-        finishes); or "auto", which chooses between them by the sizes and the tolerance.
+        finishes); or "auto", which chooses between them by the sizes and the tolerance, and solves few pairs in NumPy
+        before a program would be compiled.
       max_iterations: per pair, 100,000 if not given; a pair that needs more says so in `status` and keeps valid bounds.
       progress: show a progress bar.
       table: what is known already, of the same model, `distance` and `anchored`: asked first, and filled. Made anew if

@@ -1,8 +1,11 @@
-"""Measures the path from demonstrations to the learned policy as one program of a key, compiled and mapped over draws.
+"""Measures what a fresh process waits for: pairs of local models, and the whole path as one program of a key.
 
-A section is a domain. Its rows: the program over all draws at once, the same sharded over two devices that are forced
-on the host, and the plain calls in a loop. They are judged against each other: votes and radii have to be the same draw
-by draw, and the bounds of margins have to overlap. "settled" is the share of draws for which that holds and whose
+A section of pairs solves so many random pairs of five states, four actions, as brackets or decisions: the first call,
+and the median of three more, beside HiGHS, which solves one after the other on one core.
+
+A section of draws is a domain. Its rows: the program over all draws at once, the same sharded over two devices that are
+forced on the host, and the plain calls in a loop. They are judged against each other: votes and radii have to be the same
+draw by draw, and the bounds of margins have to overlap. "settled" is the share of draws for which that holds and whose
 certificates are closed.
 """
 
@@ -21,12 +24,15 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
+from bench import similarity_speed  # noqa: E402
 from bench.processes import peak_gb  # noqa: E402
 from bench.provenance import provenance  # noqa: E402
+from jaxhom.similarity.brackets import Goal, bracket_errors  # noqa: E402
 
 SEED = 0
 _LOOP = 5  # draws of the plain calls, after the first
-_PACKAGES = ("jax", "numpy")
+_PACKAGES = ("jax", "numpy", "highspy")
+_HIGHS_PAIRS = 512  # at most: its time is proportional
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,9 +95,39 @@ DOMAINS = {
 }
 
 
+PAIRS = {f"{work}_{count}": (work, count) for work in ("pairs", "decisions") for count in (2, 100, 1000, 10_000)}
+
+
 def section(name: str, quick: bool, methods: None, limit: None) -> Iterator[dict]:
-    """The rows of a domain."""
+    """All rows of a section."""
     del methods, limit
+    yield from _pair_rows(*PAIRS[name]) if name in PAIRS else _draw_rows(name, quick)
+
+
+def _pair_rows(work: str, count: int) -> Iterator[dict]:
+    """Brackets or decisions of random pairs: ours, and HiGHS's."""
+    source, target = similarity_speed.random_pairs(5, count)
+    threshold = similarity_speed.THRESHOLD if work == "decisions" else np.nan
+    goal = Goal(tolerance=similarity_speed.GAP, threshold=threshold)
+    found, first, seconds, _ = similarity_speed.clocked(lambda: bracket_errors(source, target, goal=goal))
+    settled = similarity_speed.judged(found.lower, found.upper, threshold=threshold)["settled"]
+    fields = {"instance": f"{work} of 5 states", "devices": 1, "status": "measured", "note": ""} | provenance(
+        *_PACKAGES
+    )
+    times = {"first_s": first, "seconds": seconds / count, "peak_gb": peak_gb(), "settled": settled}
+    yield fields | {"method": "jaxhom", "draws": count} | times
+    some = similarity_speed.random_pairs(5, min(count, _HIGHS_PAIRS))
+    pairs, settings = list(zip(*some, strict=True)), similarity_speed.PEERS["highs_simplex"]
+    row = similarity_speed.peer_row(
+        work, "highs_simplex", pairs, settings, similarity_speed.pair_problem(*some), processes=1
+    )
+    ours = {name: row.get(name, "") for name in ("status", "note", "settled")}
+    ours |= {"seconds": row["seconds"] / len(pairs)} if "seconds" in row else {}
+    yield fields | {"method": "highs_simplex", "draws": len(pairs)} | ours
+
+
+def _draw_rows(name: str, quick: bool) -> Iterator[dict]:
+    """The rows of a domain."""
     domain = DOMAINS[name]
     if domain.devices > 1:  # before the first computation
         flag = f"--xla_force_host_platform_device_count={domain.devices}"

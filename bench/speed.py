@@ -89,9 +89,13 @@ KINDS = {
         has_methods=True,
     ),
     "first": Kind(
-        title="the whole path as one program of a key, compiled and mapped over draws",
-        sections=("draws_grid16", "draws_grid16_two_devices", "draws_racetrack_a"),
-        quick=("draws_grid16",),
+        title="what a fresh process waits for: pairs, and the whole path as one program",
+        sections=(
+            *("pairs_2", "pairs_100", "pairs_1000", "pairs_10000"),
+            *("decisions_2", "decisions_100", "decisions_1000", "decisions_10000"),
+            *("draws_grid16", "draws_grid16_two_devices", "draws_racetrack_a"),
+        ),
+        quick=("pairs_2", "draws_grid16"),
         fields=(
             *("section", "instance", "method", "draws", "devices", "prepare_s", "first_s", "seconds", "peak_gb"),
             *("settled", "status", "note", "versions", "commit"),

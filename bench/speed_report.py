@@ -307,11 +307,12 @@ def planning_figure(rows: list[dict]) -> Figure | None:
 
 
 _FIRST_WORDS = f"""{_MADE}
-A draw goes from a key to the value of the learned policy. "settled" is the share of draws whose votes and radii are
-those of the plain calls, and whose certificates overlap theirs and are closed; of rows without plain calls beside them,
-the share of closed certificates."""
+Every section is a process of its own, in which the first call compiles what it needs. Pairs are random local models; a
+draw goes from a key to the value of the learned policy. "settled" is the share of pairs that are, or of draws whose votes
+and radii are those of the plain calls, and whose certificates overlap theirs and are closed; of draws without plain calls
+beside them, the share of closed certificates."""
 _FIRST_HEADER = [
-    "| method | draws | devices | prepared s | first call s | ms a draw | GB | settled |",
+    "| method | number | devices | prepared s | first call s | ms each | GB | settled |",
     "|:--|--:|--:|--:|--:|--:|--:|--:|",
 ]
 
@@ -323,7 +324,7 @@ def first_table(rows: list[dict]) -> str:
         members = [row for row in rows if row["instance"] == title and row["status"] == "measured"]
         parts.append((title, _FIRST_HEADER, [_first_cells(row) for row in members]))
     failed = [f"{row['section']}: {row['status']}, {row['note']}" for row in rows if row["status"] != "measured"]
-    return "\n".join([document("Draws of the whole path", _FIRST_WORDS, parts), *failed])
+    return "\n".join([document("The first answer", _FIRST_WORDS, parts), *failed])
 
 
 def _first_cells(row: dict) -> list:

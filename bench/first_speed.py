@@ -4,9 +4,9 @@ A section of pairs solves so many random pairs of five states, four actions, as 
 and the median of three more, beside HiGHS, which solves one after the other on one core.
 
 A section of draws is a domain. Its rows: the program over all draws at once, the same sharded over two devices that are
-forced on the host, and the plain calls in a loop. They are judged against each other: votes and radii have to be the same
-draw by draw, and the bounds of margins have to overlap. "settled" is the share of draws for which that holds and whose
-certificates are closed.
+forced on the host, and the plain calls in a loop. They are judged against each other: votes and radii have to be the
+same draw by draw, and the bounds of margins have to overlap. "settled" is the share of draws for which that holds and
+whose certificates are closed.
 """
 
 from __future__ import annotations

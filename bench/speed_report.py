@@ -307,10 +307,10 @@ def planning_figure(rows: list[dict]) -> Figure | None:
 
 
 _FIRST_WORDS = f"""{_MADE}
-Every section is a process of its own, in which the first call compiles what it needs. Pairs are random local models; a
-draw goes from a key to the value of the learned policy. "settled" is the share of pairs that are, or of draws whose votes
-and radii are those of the plain calls, and whose certificates overlap theirs and are closed; of draws without plain calls
-beside them, the share of closed certificates."""
+Every section is a process of its own, in which the first call compiles what it needs. Pairs are random local models;
+a draw goes from a key to the value of the learned policy. "settled" is the share of pairs that are, or of draws whose
+votes and radii are those of the plain calls, and whose certificates overlap theirs and are closed; of draws without
+plain calls beside them, the share of closed certificates."""
 _FIRST_HEADER = [
     "| method | number | devices | prepared s | first call s | ms each | GB | settled |",
     "|:--|--:|--:|--:|--:|--:|--:|--:|",

@@ -103,7 +103,7 @@ def lpal(
     Works under `jit`, `vmap` and `grad`, in all arrays of the model but its graph (`next_state`), in expectations and
     starts; options are constants. Inside a program method "pdhg" runs, which is what "auto" means there, in one loop of
     at most 1,000 iterations, with columns in between (`jaxhom.apprenticeship.in_program`); under `vmap` all lanes are
-    one batch. Its bounds are in the model's type: in float32 they are as wide as its rounding, some 1e-6 /
+    one batch. Its bounds are in the model's type: in float32 they are as wide as its rounding, some 1e-5 /
     (1 - discount)^2. Close over a model and exchange its arrays by `mdp.replace(...)`: one that is an argument itself
     has a traced graph, and may have up to 4,096 states. With concrete values alone a call inside a program runs at once
     and is a constant.

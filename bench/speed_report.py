@@ -328,7 +328,7 @@ def first_table(rows: list[dict]) -> str:
 
 
 def _first_cells(row: dict) -> list:
-    times = shown(row, prepare_s=".1f", first_s=".1f")
+    times = shown(row, prepare_s=".2g", first_s=".2g")
     seconds = number(row, "seconds")
     draw = "" if seconds is None else f"{1e3 * seconds:.3g}"
     return [row["method"], row["draws"], row["devices"], *times, draw, *shown(row, peak_gb=".2g", settled=".0%")]

@@ -6,13 +6,16 @@ code never checks values. Shapes are reported as expected against actual.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import operator
 import reprlib
 from collections.abc import Callable
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 if TYPE_CHECKING:
@@ -54,6 +57,20 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def is_at_hand(*trees: Any) -> bool:
+    """Whether work on these arrays can be done on the host: they are concrete, and JAX computes on this CPU."""
+    return not is_traced(*trees) and jax.default_backend() == "cpu"
+
+
+def arrays_of(*trees: Any) -> ModuleType:
+    """What to compute with: NumPy on values at hand, where XLA would compile a program per operation; else `jax.numpy`.
+
+    Callers pass arrays through the module's `asarray`, and what they return through `to_device` where it leaves the
+    library.
+    """
+    return np if is_at_hand(*trees) else jnp
+
+
 def eager_where_concrete(function: F) -> F:
     """A door whose calls with concrete values alone run at once, under `jit` and `vmap` too, and give constants there.
 
@@ -64,10 +81,19 @@ def eager_where_concrete(function: F) -> F:
     def call(*args, **keywords):
         if is_traced(args, keywords):
             return function(*args, **keywords)
-        with jax.ensure_compile_time_eval():
+        with at_once():
             return function(*args, **keywords)
 
     return call
+
+
+def at_once() -> contextlib.AbstractContextManager:
+    """Within it, what is concrete is computed at once, inside a program too, where it becomes a constant.
+
+    Elsewhere nothing is changed: JAX would compute the constants of programs one by one, each a program of its own.
+    """
+    is_inside = isinstance(jax.device_put(0), jax.core.Tracer)
+    return jax.ensure_compile_time_eval() if is_inside else contextlib.nullcontext()
 
 
 def refuse_traced(**options: Any) -> None:

@@ -17,12 +17,13 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "jaxhom"
 
 # Every room, and all the rooms that it may import from. `jaxhom` is the face, jaxhom/__init__.py.
-TOOLS = {"checks", "status"}
+TOOLS = {"checks", "status", "programs"}
 GIVEN = TOOLS | {"models", "solvers"}
 CORE = GIVEN | {"planning", "similarity", "generalization", "apprenticeship", "domains"}
 MAY_IMPORT = {
     "checks": set(),
     "status": set(),
+    "programs": set(),
     "interrupts": set(),
     "models": TOOLS,
     "solvers": TOOLS,

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom.programs import host_jit
 from jaxhom.solvers import pdhg
 from jaxhom.solvers.game_interior_point import GameSolution, solve_game
 from jaxhom.solvers.game_pdhg import MatrixGame
-from jaxhom.solvers.programs import host_jit
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float
@@ -42,6 +42,8 @@ def play(
     tolerance: Float[ArrayLike, "*games"],
     share: float,
     width: int,
+    *,
+    on_host: bool = False,
 ) -> GameSolution:
     """Solves games, loosely where much is open.
 
@@ -52,6 +54,7 @@ def play(
       tolerance, share: a game is solved when its own gap is below its tolerance (one for all, or one per game), or
         below this share of what is open between its lower bound and `bounds`.
       width: games that are solved at a time, at least as many as there are: it decides which programs are compiled.
+      on_host: one by one in NumPy; not where a normal matrix would be large.
 
     Returns:
       The solutions, in NumPy arrays with the games first; q is padded with zeros.
@@ -59,6 +62,11 @@ def play(
     num_features = len(payoffs[0])
     most = max(payoff.shape[1] for payoff in payoffs)
     capacity = next(capacity for capacity in capacities(num_features) if most <= capacity)
+    is_newton = min(num_features, capacity) <= _MAX_NEWTON_SIZE
+    if on_host and is_newton:
+        goals = np.broadcast_to(tolerance, len(payoffs))
+        games = zip(payoffs, former, bounds, goals, strict=True)
+        return _stacked([_play_on_host(*game, share) for game in games], capacity)
     dtype = payoffs[0].dtype
     stacked = np.zeros((width, num_features, capacity), dtype)
     start = np.zeros((width, num_features), dtype), np.zeros((width, capacity), dtype)
@@ -69,8 +77,19 @@ def play(
         start[0][k], start[1][k, :count], bound[k] = w, q, bounds[k]
     goal = np.ones(width, dtype)
     goal[: len(payoffs)] = tolerance
-    solve = _by_interior_point if min(num_features, capacity) <= _MAX_NEWTON_SIZE else _by_pdhg
+    solve = _by_interior_point if is_newton else _by_pdhg
     return jax.tree.map(np.asarray, solve(stacked, is_column, bound, start, goal, share))
+
+
+def _play_on_host(payoff, former, bound, tolerance, share) -> GameSolution:
+    everything = np.ones(payoff.shape[1], bool)
+    return solve_game(payoff, everything, tolerance=tolerance, share=share, bound=bound, start=former)
+
+
+def _stacked(games: list[GameSolution], capacity: int) -> GameSolution:
+    """Solutions of games with different numbers of columns, as `play` returns them."""
+    games = [game.replace(q=np.pad(game.q, (0, capacity - len(game.q)))) for game in games]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *games)
 
 
 @host_jit

@@ -55,7 +55,7 @@ class Rounds:
         self._room = capacities(mdp.num_features)[-1]
         self._pulls = _FEW_PULLS if mdp.num_features <= _FEW_FEATURES else _PULLS
         self._error = 0.25 * SLACK * float(request.tolerance.min())
-        self._exact = request.model.once(_exact_where_rough)
+        self._exact = request.model.once(_exact_where_rough) or _exact_if_small(request)
 
     def lanes(self) -> list[Lane]:
         """One for each problem; with a first column where there is a policy to begin with."""
@@ -196,7 +196,7 @@ class Rounds:
         ]
         bounds = [lane.bound for lane in lanes]
         goals = [0.25 * lane.tolerance for lane in lanes]
-        return play(payoffs, former, bounds, goals, _LOOSE_GAME, self._width)
+        return play(payoffs, former, bounds, goals, _LOOSE_GAME, self._width, on_host=self._exact is not None)
 
     # ---------------------------------------------------------------------------------------------------------------
 
@@ -228,3 +228,9 @@ def _exact_where_rough(mdp: MDP) -> Exact | None:
     is_rough = mdp.dtype != jnp.float64 or float(mdp.discount) > NEAR_ONE
     exact = Exact(mdp) if is_rough else None
     return exact if exact and exact.is_direct else None
+
+
+def _exact_if_small(request: Request) -> Exact | None:
+    """The model on the host, where lanes are so few and small that programs would take longer to compile."""
+    exact = request.model.once(Exact)
+    return exact if exact.model.plans_sooner(len(request.lanes)) else None

@@ -199,7 +199,7 @@ class LPAL:
         if is_inside:
             solution = self._solve_in_program(batch, policy, warm_start, tolerance, method, max_iterations)
         else:
-            with jax.ensure_compile_time_eval():  # inside a program this is a constant
+            with checks.at_once():  # inside a program this is a constant
                 solution = self._solve_on_host(batch, policy, warm_start, tolerance, method, max_iterations, progress)
         if checks.is_traced(self._mdp, given):
             given = jnp.asarray(given, self._mdp.dtype).reshape(batch.shape)
@@ -228,7 +228,7 @@ class LPAL:
 
     @functools.cached_property
     def _program(self) -> Program:
-        with jax.ensure_compile_time_eval():
+        with checks.at_once():
             return Program.of_concrete(self._model)
 
 

@@ -12,7 +12,6 @@ uniform on (0, 1) otherwise (`sample_weights`).
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from typing import TYPE_CHECKING
 
@@ -22,6 +21,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
+from jaxhom.programs import quick_jit
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def gridworld(
     )
 
 
-@functools.partial(jax.jit, static_argnames="num_regions")
+@checks.eager_where_concrete
 def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
     """Draws one weight per region: 0 with probability 0.9, otherwise uniform on (0, 1).
 
@@ -143,6 +143,11 @@ def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
     """
     if num_regions < 1:
         raise ValueError(f"num_regions must be at least 1, got {num_regions}")
+    return (_weights_at_hand if checks.is_at_hand(key) else _weights)(key, num_regions)
+
+
+def _weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
+    """Draws until one is positive."""
 
     def draw(key):
         which, value = jax.random.split(key)
@@ -158,6 +163,9 @@ def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
 
     _, weights = jax.lax.while_loop(is_zero, redraw, redraw((key, None)))
     return weights
+
+
+_weights_at_hand = quick_jit(_weights, static_argnums=1)
 
 
 def _transition(coordinates, size: int, noise: float) -> tuple[np.ndarray, np.ndarray]:

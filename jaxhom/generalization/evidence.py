@@ -8,7 +8,6 @@ Two rules, whatever the method that carries the expert's policy over:
   vote there.
 """
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
@@ -18,7 +17,7 @@ from jaxhom.models.mdp import MDP, absorbing_states, uniform_policy
 def deciding(mdp: MDP, visited):
     """bool [S]: the demonstrated states in which there was something to decide."""
     absorbs = absorbing_states(mdp)
-    xp = _arrays_of(visited, absorbs)
+    xp = checks.arrays_of(visited, absorbs)
     return xp.asarray(visited) & ~xp.asarray(absorbs)
 
 
@@ -29,26 +28,21 @@ def has_vote(mdp: MDP, policy, states, experts):
     """
     if not mdp.restricts_actions:
         return np.ones(np.broadcast_shapes(np.shape(states), np.shape(experts)), bool)
-    xp = _arrays_of(mdp.allowed, policy, states, experts)
+    xp = checks.arrays_of(mdp.allowed, policy, states, experts)
     return ((xp.asarray(policy)[experts] > 0) & xp.asarray(mdp.allowed)[states]).any(axis=-1)
 
 
 def allowed_part(mdp: MDP, states, votes):
     """Votes [P, A] for `states` [P], without those for actions that these lack."""
-    xp = _arrays_of(mdp.allowed, votes)
+    xp = checks.arrays_of(mdp.allowed, votes)
     return xp.where(xp.asarray(mdp.allowed)[states], votes, 0) if mdp.restricts_actions else votes
 
 
 def policy_of_votes(mdp: MDP, votes):
     """Votes [S, A] as rows that sum to 1, and bool [S]: where any counted; elsewhere the row is uniform."""
     uniform = uniform_policy(mdp)
-    xp = _arrays_of(votes, uniform)
+    xp = checks.arrays_of(votes, uniform)
     votes = allowed_part(mdp, slice(None), xp.asarray(votes))
     total = votes.sum(axis=1, keepdims=True)
     is_found = total > 0
     return xp.where(is_found, votes / xp.where(is_found, total, 1), uniform), is_found[:, 0]
-
-
-def _arrays_of(*given):
-    """NumPy, or JAX's where something is traced."""
-    return jnp if checks.is_traced(given) else np

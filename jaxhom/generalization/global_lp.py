@@ -6,18 +6,22 @@ LP (8) of Boularias and Chaib-draa 2010: maps f [S, E] from all states to the E 
 
 with T^E the model restricted to the demonstrated states. As for the local program, e = min_f max_{|y|_1 <= 1} <y, K f>,
 any f gives an upper and any y a lower bound. The products with T are the model's own sweeps with the E columns as
-their batch; T^E is a dense tensor.
+their batch; T^E is a dense tensor. `HostProblem` is the same in NumPy, for what is solved before a program is compiled.
 
 Inside programs the demonstrated states are a list of static length that is padded: the columns of its padding stay 0
 in f and y.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
 
 from jaxhom.models.mdp import MDP, expected_next_value, push_forward
+from jaxhom.solvers.arrays import module_of
 from jaxhom.solvers.projections import project_l1_ball, project_simplex
 
 
@@ -40,29 +44,44 @@ class GlobalHomomorphismProblem:
 
     def start(self) -> tuple[jax.Array, jax.Array]:
         """Uniform rows, and y = 0."""
-        num_states, num_experts = self.pinned.shape
-        f = self.project_primal(jnp.zeros((num_states, num_experts, 1), self.mdp.dtype), None)
-        return f, jnp.zeros((num_states, self.mdp.num_actions, num_experts, 1), self.mdp.dtype)
+        numpy, (num_states, num_experts) = module_of(self.pinned), self.pinned.shape
+        f = self.project_primal(numpy.zeros((num_states, num_experts, 1), self.mdp.dtype), None)
+        return f, numpy.zeros((num_states, self.mdp.num_actions, num_experts, 1), self.mdp.dtype)
 
     def forward(self, f: jax.Array) -> jax.Array:
         """K f."""
-        f = jnp.where(self.exists, f[..., 0], 0.0)
-        moved = expected_next_value(self.mdp, f)
-        return (moved - jnp.einsum("sl,lak->sak", f, self.restricted))[..., None]
+        numpy = module_of(f)
+        f = numpy.where(self.exists, f[..., 0], 0.0)
+        return (self._expected(f) - self._mapped(f))[..., None]
 
     def adjoint(self, y: jax.Array) -> jax.Array:
         """K^T y."""
-        pushed = push_forward(self.mdp, y[..., 0])
-        return (pushed - jnp.einsum("sak,lak->sl", y[..., 0], self.restricted))[..., None]
+        return (self._pushed(y[..., 0]) - self._mapped_back(y[..., 0]))[..., None]
+
+    def _expected(self, f: jax.Array) -> jax.Array:
+        """sum_s'' T(s, a, s'') f(s'', k), [S, A, E]."""
+        return expected_next_value(self.mdp, f)
+
+    def _pushed(self, y: jax.Array) -> jax.Array:
+        """sum_{s, a} T(s, a, s'') y(s, a, k), [S, E]."""
+        return push_forward(self.mdp, y)
+
+    def _mapped(self, f: jax.Array) -> jax.Array:
+        """sum_l f(s, l) T^E(l, a, k), [S, A, E]."""
+        return jnp.einsum("sl,lak->sak", f, self.restricted)
+
+    def _mapped_back(self, y: jax.Array) -> jax.Array:
+        """sum_{a, k} y(s, a, k) T^E(l, a, k), [S, E]."""
+        return jnp.einsum("sak,lak->sl", y, self.restricted)
 
     def project_primal(self, point: jax.Array, step) -> jax.Array:
         """Rows onto the simplex; pinned rows to their entry."""
         del step
-        point = point[..., 0]
-        largest = jnp.max(point, axis=1, keepdims=True, where=self.exists, initial=jnp.finfo(point.dtype).min)
-        f = project_simplex(jnp.where(self.exists, point, largest - 2.0), axis=1)  # 0 where 1 below the largest
+        numpy, point = module_of(point), point[..., 0]
+        largest = numpy.max(point, axis=1, keepdims=True, where=self.exists, initial=numpy.finfo(point.dtype).min)
+        f = project_simplex(numpy.where(self.exists, point, largest - 2.0), axis=1)  # 0 where 1 below the largest
         is_pinned = self.pinned.any(axis=1, keepdims=True)
-        return jnp.where(is_pinned, self.pinned.astype(f.dtype), f)[..., None]
+        return numpy.where(is_pinned, self.pinned.astype(f.dtype), f)[..., None]
 
     def project_dual(self, point: jax.Array, step) -> jax.Array:
         """Onto the ball |y|_1 <= 1."""
@@ -71,28 +90,66 @@ class GlobalHomomorphismProblem:
 
     def bounds(self, f, y, forward, adjoint) -> tuple[jax.Array, jax.Array]:
         """Certified bounds, widened by the rounding of the sums that make them."""
+        numpy = module_of(f)
         f, y, forward, adjoint = (array[..., 0] for array in (f, y, forward, adjoint))
         num_states, num_actions, num_experts = forward.shape
-        eps = jnp.finfo(forward.dtype).eps
-        defect = jnp.abs(f.sum(axis=1) - 1.0).max()
-        upper = jnp.abs(forward).max() + 2.0 * defect + (self.mdp.probability.shape[-1] + num_experts + 2) * eps
-        lowest = jnp.where(self.pinned.any(axis=1), (self.pinned * adjoint).sum(axis=1), self._least(adjoint))
-        value = lowest.sum() / jnp.maximum(jnp.abs(y).sum(), 1.0)
+        eps = numpy.finfo(forward.dtype).eps
+        defect = numpy.abs(f.sum(axis=1) - 1.0).max()
+        upper = numpy.abs(forward).max() + 2.0 * defect + (self.mdp.probability.shape[-1] + num_experts + 2) * eps
+        lowest = numpy.where(self.pinned.any(axis=1), (self.pinned * adjoint).sum(axis=1), self._least(adjoint))
+        value = lowest.sum() / numpy.maximum(numpy.abs(y).sum(), 1.0)
         # Rounding in K^T y is relative to the |y| that is summed, whose total is 1, spread over the chains of sums.
         rounding = 4.0 * (num_actions * num_experts + self.mdp.probability.shape[-1]) * eps
-        lower = jnp.maximum(value - rounding - jnp.sqrt(num_states) * eps, 0.0)
+        lower = numpy.maximum(value - rounding - numpy.sqrt(num_states) * eps, 0.0)
         return lower[None], upper[None]
 
     def _least(self, adjoint: jax.Array) -> jax.Array:
         """[S]: the least entry of each row that is no padding."""
-        return jnp.where(self.exists, adjoint, jnp.inf).min(axis=1)
+        numpy = module_of(adjoint)
+        return numpy.where(self.exists, adjoint, numpy.inf).min(axis=1)
 
     def norm_bound(self) -> jax.Array:
         """sqrt(|K|_1 |K|_inf), from the row and column sums of T and T^E."""
-        ones = jnp.ones((self.mdp.num_states, self.mdp.num_actions), self.mdp.dtype)
-        into_states = push_forward(self.mdp, ones).max()
+        numpy = module_of(self.pinned)
+        ones = numpy.ones((self.mdp.num_states, self.mdp.num_actions, 1), self.mdp.dtype)
+        into_states = self._pushed(ones).max()
         into_experts = self.restricted.sum(axis=0).max()
-        return jnp.sqrt((into_states + self.mdp.num_actions) * (1.0 + into_experts))[None]
+        return numpy.sqrt((into_states + self.mdp.num_actions) * (1.0 + into_experts))[None]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class HostProblem(GlobalHomomorphismProblem):
+    """The same in NumPy and SciPy; one batch of products with T^E and one with T, both sparse where T is.
+
+    Attributes:
+      rows: [S A, S], the rows of T.
+    """
+
+    rows: scipy.sparse.csr_array | np.ndarray
+
+    @functools.cached_property
+    def _within(self) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
+        """T^E as [E, A E], and its transpose."""
+        matrix = scipy.sparse.csr_array(self.restricted.reshape(len(self.restricted), -1))
+        return matrix, matrix.T.tocsr()
+
+    def on_device(self) -> GlobalHomomorphismProblem:
+        """The problem for programs."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(GlobalHomomorphismProblem)}
+        return GlobalHomomorphismProblem(**fields)
+
+    def _expected(self, f):
+        return (self.rows @ f).reshape(*self.mdp.allowed.shape, -1)
+
+    def _pushed(self, y):
+        return self.rows.T @ y.reshape(self.rows.shape[0], -1)
+
+    def _mapped(self, f):
+        return (self._within[1] @ f.T).T.reshape(*self.mdp.allowed.shape, -1)
+
+    def _mapped_back(self, y):
+        return (self._within[0] @ y.reshape(len(y), -1).T).T
 
 
 def restricted_to_list(mdp: MDP, experts: jax.Array) -> jax.Array:

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
@@ -93,11 +92,16 @@ def extend(mdp: MDP, start: Generalization, votes: Votes, explainer, **more) -> 
       **more: further fields of the result.
     """
     policy = evidence.policy_of_votes(mdp, votes.policy)[0] if mdp.restricts_actions else votes.policy
-    visited = start.visited
+    xp = checks.arrays_of(start, votes)
+    visited = xp.asarray(start.visited)
+
+    def of_votes(old, new):
+        return checks.to_device(xp.where(visited.reshape(-1, *(1,) * (new.ndim - 1)), xp.asarray(old), new))
+
     return start.replace(
-        policy=jnp.where(visited[:, None], start.policy, policy),
-        radius=jnp.where(visited, start.radius, votes.radius),
-        support=jnp.where(visited, start.support, votes.support),
+        policy=of_votes(start.policy, policy),
+        radius=of_votes(start.radius, votes.radius),
+        support=of_votes(start.support, votes.support),
         explainer=explainer,
         **more,
     )

@@ -15,17 +15,21 @@ from tqdm import tqdm
 from jaxhom import checks
 from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import LEAST_SHARE, ByGlobalMap
-from jaxhom.generalization.global_lp import GlobalHomomorphismProblem, restricted_to_list
+from jaxhom.generalization.global_lp import GlobalHomomorphismProblem, HostProblem, restricted_to_list
 from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
+from jaxhom.programs import host_jit
 from jaxhom.similarity.local_models import restricted_model
 from jaxhom.solvers import pdhg
 from jaxhom.solvers.lane_queue import is_settled
 from jaxhom.status import Status
 
+# Numbers of y [S, A, E] up to which NumPy iterates: a 16 x 16 grid with 51 demonstrated states, 5e4, takes it 1.2 s,
+# where the program compiles for 3; with 2e5 an iteration takes it three times as long as the program.
+_SMALL_WORK = 1e5
 _ITERATIONS_PER_REPORT = 320  # a program cannot be interrupted
 
 
@@ -105,11 +109,12 @@ class _Solved(NamedTuple):
 def _generalization(mdp: MDP, start: Generalization, solved: _Solved) -> Generalization:
     """The averages as a policy; uniform where nothing is left of them."""
     policy, is_found = evidence.policy_of_votes(mdp, solved.votes)
-    visited, chosen = start.visited, (solved.mapping > LEAST_SHARE).sum(axis=1)
+    xp, chosen = checks.arrays_of(start, policy), (solved.mapping > LEAST_SHARE).sum(axis=1)
+    visited = xp.asarray(start.visited)
     return start.replace(
-        policy=jnp.where(visited[:, None], start.policy, checks.to_device(policy, mdp.dtype)),
-        radius=jnp.where(visited, 0, jnp.where(is_found, 1, -1)).astype(jnp.int32),
-        support=jnp.where(visited, 1, jnp.where(is_found, chosen, 0)).astype(jnp.int32),
+        policy=checks.to_device(xp.where(visited[:, None], xp.asarray(start.policy), policy), mdp.dtype),
+        radius=checks.to_device(xp.where(visited, 0, xp.where(is_found, 1, -1)), jnp.int32),
+        support=checks.to_device(xp.where(visited, 1, xp.where(is_found, chosen, 0)), jnp.int32),
         error_lower=checks.to_device(solved.lower, mdp.dtype),
         error_upper=checks.to_device(solved.upper, mdp.dtype),
         status=checks.to_device(solved.status, jnp.int32),
@@ -122,7 +127,7 @@ def _solve_on_host(mdp: MDP, start, experts: np.ndarray, anchored, tolerance, ma
     if not experts.size:
         nothing = np.zeros((mdp.num_states, mdp.num_actions))
         return _Solved(nothing, nothing[:, :0], np.inf, np.inf, Status.SOLVED)
-    problem = _problem(mdp, experts, anchored)
+    problem = _host_problem(mdp, experts, anchored)
     state = _solve_with_progress(problem, tolerance, max_iterations, progress)
     lower, upper = state.lower[0], state.upper[0]
     is_met = is_settled(float(lower), float(upper), tolerance)
@@ -154,30 +159,35 @@ def _solve_in_program(mdp: MDP, start, experts: jax.Array, anchored, tolerance, 
     return _Solved(votes, mapping, lower, upper, jnp.where(is_met, Status.SOLVED, Status.ITERATION_LIMIT))
 
 
-def _problem(mdp: MDP, experts: np.ndarray, anchored: bool) -> GlobalHomomorphismProblem:
+def _host_problem(mdp: MDP, experts: np.ndarray, anchored: bool) -> HostProblem:
     pinned = np.zeros((mdp.num_states, len(experts)), bool)
     if anchored:
         pinned[experts, np.arange(len(experts))] = True
-    return GlobalHomomorphismProblem(
+    return HostProblem(
         mdp=mdp,
-        restricted=checks.to_device(restricted_model(mdp, experts)),
-        pinned=checks.to_device(pinned),
-        exists=checks.to_device(np.ones(len(experts), bool)),
+        restricted=restricted_model(mdp, experts).astype(mdp.dtype),
+        pinned=pinned,
+        exists=np.ones(len(experts), bool),
+        rows=mdp.dynamics.host_matrix(np.asarray(mdp.probability)),
     )
 
 
 def _solve_with_progress(problem, tolerance: float, max_iterations: int, progress: bool) -> pdhg.PDHGState:
     """Runs the engine a few hundred iterations at a time, so that the host can report and be interrupted."""
-    state = jax.jit(pdhg.init)(problem)
+    run, state = _solve_some, pdhg.init(problem)
+    if state.dual.size > _SMALL_WORK:
+        run, problem, state = _run_engine, *jax.tree.map(checks.to_device, (problem.on_device(), state))
     with tqdm(total=max_iterations, desc="homomorphism", unit="iteration", disable=not progress) as bar:
         while int(state.steps[0]) < max_iterations and float(state.upper[0] - state.lower[0]) > tolerance:
             limit = min(int(state.steps[0]) + _ITERATIONS_PER_REPORT, max_iterations)
-            state = _run_engine(problem, state, tolerance, limit)
+            state = run(problem, state, tolerance, limit)
             bar.update(int(state.steps[0]) - bar.n)
             bar.set_postfix(lower=f"{float(state.lower[0]):.4f}", upper=f"{float(state.upper[0]):.4f}")
     return state
 
 
-@jax.jit
-def _run_engine(problem, state, tolerance, max_iterations) -> pdhg.PDHGState:
+def _solve_some(problem, state, tolerance, max_iterations) -> pdhg.PDHGState:
     return pdhg.solve(problem, state, tolerance=tolerance, max_iterations=max_iterations)
+
+
+_run_engine = host_jit(_solve_some)

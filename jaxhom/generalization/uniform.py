@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 
-import jax.numpy as jnp
+import numpy as np
 
 from jaxhom import checks
 from jaxhom.generalization.explainers import nothing_is_looked_for
@@ -43,13 +43,15 @@ def uniform_elsewhere(mdp: MDP, demonstrations: Demonstrations) -> Generalizatio
     """
     mdp = as_model(mdp)
     visited, policy = empirical_policy(mdp, demonstrations)
+    xp = checks.arrays_of(visited)
+    support = xp.asarray(visited, np.int32)
     return Generalization(
         policy=policy,
         visited=visited,
-        radius=jnp.where(visited, 0, -1).astype(jnp.int32),
-        support=visited.astype(jnp.int32),
-        undecided=jnp.zeros_like(visited, jnp.int32),
-        status=jnp.asarray(Status.SOLVED, jnp.int32),
+        radius=checks.to_device(support - 1),
+        support=checks.to_device(support),
+        undecided=checks.to_device(xp.zeros_like(support)),
+        status=checks.to_device(Status.SOLVED, np.int32),
         explainer=None if checks.is_traced(visited) else nothing_is_looked_for,
     )
 

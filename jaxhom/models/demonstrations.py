@@ -21,6 +21,7 @@ from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.models.sampling import sample_walks
 from jaxhom.models.trajectories import padded, require_flags
+from jaxhom.programs import quick_jit
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ class Demonstrations(Record):
         defaults = {"terminated": (False, bool), "final_states": (-1, jnp.int32)}
         for name, (value, dtype) in defaults.items():
             if getattr(self, name) is None:
-                filled = jnp.full(self.mask.shape[:-1], value, dtype) if is_array else self.mask
+                filled = checks.to_device(np.full(self.mask.shape[:-1], value, dtype)) if is_array else self.mask
                 object.__setattr__(self, name, filled)
 
     @classmethod
@@ -198,15 +199,21 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[Bool[Arr
     mdp = as_model(mdp)
     demonstrations.validate(mdp, "warn")
     shape = (mdp.num_states, mdp.num_actions)
+    states, actions, mask = demonstrations.states, demonstrations.actions, demonstrations.mask
+    xp = checks.arrays_of(mdp, states, actions, mask)
     # Counted in integers and divided in JAX's default type: float32 would stop counting at 2^24, float16 at 2^11.
-    weight = demonstrations.mask.astype(jnp.int32)
-    counts = jnp.zeros(shape, jnp.int32).at[demonstrations.states, demonstrations.actions].add(weight).astype(float)
+    if xp is np:
+        pairs = np.ravel_multi_index((np.asarray(states)[mask], np.asarray(actions)[mask]), shape)
+        counts = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
+    else:
+        counts = jnp.zeros(shape, jnp.int32).at[states, actions].add(mask.astype(jnp.int32)).astype(float)
     visits = counts.sum(axis=-1, keepdims=True)
     visited = visits[:, 0] > 0
-    frequencies = (counts / jnp.maximum(visits, 1.0)).astype(mdp.dtype)
-    return visited, jnp.where(visited[:, None], frequencies, uniform_policy(mdp))
+    frequencies = (counts / xp.maximum(visits, 1.0)).astype(mdp.dtype)
+    return tuple(map(checks.to_device, (visited, xp.where(visited[:, None], frequencies, uniform_policy(mdp)))))
 
 
+@checks.eager_where_concrete
 def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> Float[Array, " K"]:
     """Feature expectations as the demonstrations' mean, 1/M sum_m sum_t gamma^t phi(s_t, a_t), t from 0.
 
@@ -241,14 +248,14 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
     """
     mdp = as_model(mdp)
     demonstrations.validate(mdp, "warn")
-    expectations, is_lost = _expectations(mdp, demonstrations)
+    is_little = checks.is_at_hand(mdp, demonstrations)  # the sums take less time than any program compiles
+    expectations, is_lost = (_expected_at_hand if is_little else _expectations)(mdp, demonstrations)
     if not checks.is_traced(is_lost):
         episode_ends.refuse_lost(demonstrations, np.asarray(is_lost))
     return expectations
 
 
-@jax.jit
-def _expectations(mdp: MDP, demonstrations: Demonstrations) -> tuple[Float[Array, " K"], Bool[Array, " M"]]:
+def _expected(mdp: MDP, demonstrations: Demonstrations) -> tuple[Float[Array, " K"], Bool[Array, " M"]]:
     steps = jnp.arange(demonstrations.horizon)
     weight = jnp.where(demonstrations.mask, mdp.discount**steps, 0.0)
     # Weights are summed per pair first: [M, H, K] would not fit for long demonstrations and many features.
@@ -257,6 +264,10 @@ def _expectations(mdp: MDP, demonstrations: Demonstrations) -> tuple[Float[Array
     return jnp.einsum("sa,sak->k", pairs, mdp.features) / demonstrations.num_trajectories, is_lost
 
 
+_expectations, _expected_at_hand = jax.jit(_expected), quick_jit(_expected)
+
+
+@checks.eager_where_concrete
 def sample_demonstrations(
     key: Key[Array, ""],
     mdp: MDP,

@@ -46,13 +46,19 @@ def check_policy(mdp: MDP, policy: Any, name: str = "policy", *, batch: bool = T
     if policy.ndim == 1:
         if not is_traced:
             policy = checks.require_integers(name, policy, upper=mdp.num_actions)
-        policy = jax.nn.one_hot(policy, mdp.num_actions, dtype=mdp.dtype)
+            return checks.to_device(_allowed_only(mdp, name, np.eye(mdp.num_actions)[policy]), mdp.dtype)
+        return jax.nn.one_hot(policy, mdp.num_actions, dtype=mdp.dtype)
     if is_traced:
         return jnp.asarray(policy, mdp.dtype)
-    host = checks.require_distribution(name, np.asarray(policy))
+    return checks.to_device(_allowed_only(mdp, name, checks.require_distribution(name, policy)), mdp.dtype)
+
+
+def _allowed_only(mdp: MDP, name: str, policy: Float[np.ndarray, "*B S A"]) -> Float[np.ndarray, "*B S A"]:
+    """The policy, or `ValueError` where it takes an action that is not allowed."""
     if mdp.restricts_actions:
-        checks.require_all(name, host, (host == 0) | np.asarray(mdp.allowed), "is an action that is not allowed there")
-    return checks.to_device(host, mdp.dtype)
+        message = "is an action that is not allowed there"
+        checks.require_all(name, policy, (policy == 0) | np.asarray(mdp.allowed), message)
+    return policy
 
 
 def require_policy_shape(mdp: MDP, policy: Any, name: str = "policy", *, batch: bool = True) -> Array | np.ndarray:
@@ -92,7 +98,9 @@ def check_coordinates(mdp: MDP, coordinates: Float[ArrayLike, "S D"]) -> Float[n
     return coordinates if is_traced else checks.require_floats("coordinates", coordinates)
 
 
-def check_reward(mdp: MDP, reward: Num[ArrayLike, "*B S A"], policy_shape: tuple[int, ...]) -> Float[Array, "*B S A"]:
+def check_reward(
+    mdp: MDP, reward: Num[ArrayLike, "*B S A"], policy_shape: tuple[int, ...]
+) -> Float[Array | np.ndarray, "*B S A"]:
     """A reward that goes with a policy, in the model's type; 0 where an action is not allowed.
 
     Args:
@@ -113,8 +121,10 @@ def check_reward(mdp: MDP, reward: Num[ArrayLike, "*B S A"], policy_shape: tuple
 
 def check_reward_values(
     mdp: MDP, reward: Num[ArrayLike, "..."], *, forbidden: float = 0.0, may_forbid: bool = False
-) -> Float[Array, "..."]:
+) -> Float[Array | np.ndarray, "..."]:
     """Rewards [..., S, A] or [..., S] in the model's type; `forbidden` stands where an action is not allowed.
+
+    In NumPy where they are concrete.
 
     Raises:
       ValueError: naming the first concrete value that is NaN or infinite; with `may_forbid`, -inf is accepted.
@@ -128,7 +138,8 @@ def check_reward_values(
             host = np.where(np.asarray(mdp.allowed), host, 0)
         minus = (host == -np.inf) if may_forbid and host.dtype.kind == "f" else np.zeros(host.shape, bool)
         finite = checks.require_floats_in(mdp.dtype, "reward", np.where(minus, 0, host))
-        reward = checks.to_device(np.where(minus, -np.inf, finite), mdp.dtype)
+        reward = np.where(minus, -np.inf, finite).astype(mdp.dtype)
     if mdp.restricts_actions and reward.shape[-2:] == (mdp.num_states, mdp.num_actions):
-        reward = jnp.where(mdp.allowed, reward, forbidden)
+        xp = checks.arrays_of(mdp.allowed, reward)
+        reward = xp.where(xp.asarray(mdp.allowed), reward, forbidden)
     return reward

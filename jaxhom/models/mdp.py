@@ -264,14 +264,15 @@ def state_transition(mdp: MDP, policy: Float[Array, "S A"]) -> Float[Array, "S S
 
 
 def absorbing_states(mdp: MDP) -> Bool[Array, " S"]:
-    """The states that every allowed action stays in with certainty; works under `jit` and `vmap`."""
-    leaves = mdp.next_state != jnp.arange(mdp.num_states, dtype=mdp.next_state.dtype)[:, None, None]
-    return jnp.where(leaves, mdp.probability, 0.0).sum(axis=(1, 2)) == 0
+    """The states that every allowed action stays in with certainty; in NumPy at hand, also under `jit` and `vmap`."""
+    xp = checks.arrays_of(mdp.next_state, mdp.probability)
+    leaves = xp.asarray(mdp.next_state) != xp.arange(mdp.num_states, dtype=mdp.next_state.dtype)[:, None, None]
+    return ~(leaves & (xp.asarray(mdp.probability) > 0)).any(axis=(1, 2))
 
 
 def uniform_policy(mdp: MDP) -> Float[Array, "S A"]:
-    """Every allowed action alike; works under `jit` and `vmap`."""
-    allowed = mdp.allowed.astype(mdp.dtype)
+    """Every allowed action alike; in NumPy at hand, also under `jit` and `vmap`."""
+    allowed = checks.arrays_of(mdp.allowed).asarray(mdp.allowed, mdp.dtype)
     return allowed / allowed.sum(axis=-1, keepdims=True)
 
 

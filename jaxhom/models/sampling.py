@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 
+from jaxhom import checks
 from jaxhom.models.mdp import MDP
+from jaxhom.programs import quick_jit
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Bool, Float, Int, Key
 
 _SHORT = 1024  # entries of a row
+_FEW_STEPS = 100_000  # of all walks, up to which they are drawn in less time than a better program compiles
 
 
-@functools.partial(jax.jit, static_argnums=(4, 5))
 def sample_walks(
+    key: Key[Array, ""], mdp: MDP, policy: Float[Array, "S A"], terminal: Bool[Array, " S"] | None, *counts: int
+) -> dict[str, Array]:
+    """Walks of at most H steps from the initial distribution; a walk stays where it met a terminal state.
+
+    Args:
+      key: of the draws.
+      mdp: the model. policy: [S, A]. terminal: bool [S], or None.
+      counts: M walks, H steps.
+
+    Returns:
+      Fields of `Demonstrations`: `states`, `actions` and `mask` [M, H], 0 where a walk has ended; where states are
+      terminal also `terminated` and `final_states` [M].
+    """
+    is_little = checks.is_at_hand(key, mdp, policy, terminal) and counts[0] * counts[1] <= _FEW_STEPS
+    return (_little_program if is_little else _program)(key, mdp, policy, terminal, *counts)
+
+
+def _walks(
     key: Key[Array, ""],
     mdp: MDP,
     policy: Float[Array, "S A"],
@@ -25,12 +44,7 @@ def sample_walks(
     num_walks: int,
     horizon: int,
 ) -> dict[str, Array]:
-    """Walks of at most H steps from the initial distribution; a walk stays where it met a terminal state.
-
-    Returns:
-      Fields of `Demonstrations`: `states`, `actions` and `mask` [M, H], 0 where a walk has ended; where states are
-      terminal also `terminated` and `final_states` [M].
-    """
+    """`sample_walks`."""
     mdp, policy = jax.lax.stop_gradient((mdp, policy))  # draws are constants
     initial_key, steps_key = jax.random.split(key)
     lanes = (num_walks,)
@@ -49,6 +63,10 @@ def sample_walks(
     last, (states, actions, mask) = jax.lax.scan(step, first, jax.random.split(steps_key, horizon))
     steps = {"states": jnp.where(mask, states, 0).T, "actions": jnp.where(mask, actions, 0).T, "mask": mask.T}
     return steps if terminal is None else {**steps, "terminated": ends[last], "final_states": last}
+
+
+_program = jax.jit(_walks, static_argnums=(4, 5))
+_little_program = quick_jit(_walks, static_argnums=(4, 5))
 
 
 def _inverse_cdf(cumulative: Float[Array, " N"], uniform: Float[Array, ""]) -> Int[Array, ""]:

@@ -13,33 +13,27 @@ from __future__ import annotations
 
 import functools
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.sparse.linalg
 
-from jaxhom import checks
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _NARROW = 8.0  # bandwidth, in square roots of S, up to which elimination fills in little: roads, grids, corridors
+_FEW_ENTRIES = 1e5  # states times bandwidth that any factor may hold: 300 states, all linked, take 2 ms
 _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
 # Up to these a solve on the host takes less time than a program's compiling, half a second; above such a discount less
 # than the hundreds of products of an iteration.
 _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _latest: dict = {}  # one entry at most
-
-
-def is_at_hand(*trees: Any) -> bool:
-    """Whether work on these arrays can be done on the host: they are concrete, and JAX computes on this CPU."""
-    return not checks.is_traced(*trees) and jax.default_backend() == "cpu"
 
 
 def host_model(mdp: MDP) -> HostModel:
@@ -111,12 +105,17 @@ class HostModel:
         A program takes half a second to compile, and hundreds of products where the chain mixes slowly.
         """
         is_near_one = self.discount > _MODERATE_DISCOUNT
-        return (lanes <= _FEW_LANES or is_near_one) and self.is_narrow and self.is_solvable
+        return (lanes <= _FEW_LANES or is_near_one) and self.is_soon_factorised
 
     def plans_sooner(self, lanes: int) -> bool:
         """Whether the host should be asked first for the best policies of so many rewards."""
         is_small = self.num_states <= _FEW_STATES or self.discount > _MODERATE_DISCOUNT
-        return lanes <= _FEW_LANES and is_small and self.is_narrow and self.is_solvable
+        return lanes <= _FEW_LANES and is_small and self.is_soon_factorised
+
+    @property
+    def is_soon_factorised(self) -> bool:
+        """Whether LU takes milliseconds: graphs like roads, and any graph of few states."""
+        return (self.is_narrow and self.is_solvable) or self.num_states * self.bandwidth <= _FEW_ENTRIES
 
     @property
     def is_solvable(self) -> bool:

@@ -28,7 +28,7 @@ from jaxhom import checks
 from jaxhom.models.inputs import as_model, check_policy, check_reward, require_policy_shape
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.chain_solver import solve_chain
-from jaxhom.planning.host_chains import host_model, is_at_hand
+from jaxhom.planning.host_chains import host_model
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -63,8 +63,8 @@ def occupancy(mdp: MDP, policy: Policy) -> Float[Array, "*B S A"]:
     """
     mdp = as_model(mdp)
     policy = check_policy(mdp, policy)
-    if is_at_hand(mdp, policy):
-        return _solve_at_hand(mdp, policy, mdp.initial, transpose=True)[..., None] * policy
+    if checks.is_at_hand(mdp, policy):
+        return checks.to_device(_occupancy_at_hand(mdp, policy))
     if policy.ndim == 3:
         return jnp.moveaxis(_occupancy(mdp, jnp.moveaxis(policy, 0, -1)), -1, 0)
     return _occupancy(mdp, policy)
@@ -94,6 +94,11 @@ def feature_expectations(mdp: MDP, policy: Policy) -> Float[Array, "*B K"]:
     Source: Boularias and Chaib-draa 2010, section II.
     """
     mdp = as_model(mdp)
+    policy = check_policy(mdp, policy)
+    if checks.is_at_hand(mdp, policy):
+        pairs, features = _occupancy_at_hand(mdp, policy), np.asarray(mdp.features)
+        expected = pairs.reshape(*policy.shape[:-2], -1) @ features.reshape(-1, mdp.num_features)
+        return checks.to_device(expected)
     return jnp.einsum("...sa,sak->...k", occupancy(mdp, policy), mdp.features)
 
 
@@ -125,9 +130,10 @@ def policy_value(mdp: MDP, policy: Policy, reward: Float[ArrayLike, "*B S A"]) -
     policy = require_policy_shape(mdp, policy)
     reward = check_reward(mdp, reward, policy.shape)
     policy = check_policy(mdp, policy)
+    if checks.is_at_hand(mdp, policy, reward):
+        reward_under_policy = (np.asarray(policy) * reward).sum(axis=-1)
+        return checks.to_device(_solve_at_hand(mdp, policy, reward_under_policy, transpose=False))
     reward_under_policy = (policy * reward).sum(axis=-1)
-    if is_at_hand(mdp, policy, reward):
-        return _solve_at_hand(mdp, policy, reward_under_policy, transpose=False)
     if policy.ndim == 3:
         batch_last = jnp.moveaxis(policy, 0, -1)
         return _solve_values(mdp, batch_last, reward_under_policy.T).T
@@ -192,7 +198,12 @@ def _solve_values(mdp: MDP, policy: jax.Array, source: jax.Array, *, is_quick: b
     return solve_chain(mdp, policy, source, transpose=False, is_quick=is_quick)
 
 
-def _solve_at_hand(mdp: MDP, policy: jax.Array, source: jax.Array, *, transpose: bool) -> jax.Array:
+def _occupancy_at_hand(mdp: MDP, policy: jax.Array) -> np.ndarray:
+    """`occupancy` of concrete policies."""
+    return _solve_at_hand(mdp, policy, np.asarray(mdp.initial), transpose=True)[..., None] * np.asarray(policy)
+
+
+def _solve_at_hand(mdp: MDP, policy: jax.Array, source: np.ndarray, *, transpose: bool) -> np.ndarray:
     """State occupancies (of sources that are distributions) or values of concrete policies, [S] or [B, S].
 
     The host is asked first where it is sure to be quick, and last, for what the device could not do, where it can.
@@ -209,4 +220,4 @@ def _solve_at_hand(mdp: MDP, policy: jax.Array, source: jax.Array, *, transpose:
     for lane in left if model.is_solvable else ():
         chain = model.chain(policies[lane])
         solutions[lane] = (chain.state_occupancy if transpose else chain.value)(sources[lane].astype(np.float64))
-    return checks.to_device(solutions.reshape(policy.shape[:-1]), mdp.dtype)
+    return solutions.reshape(policy.shape[:-1]).astype(mdp.dtype)

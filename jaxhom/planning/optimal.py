@@ -11,6 +11,7 @@ so rounding does not decide. An action that is not allowed has the value -inf.
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import jax
@@ -21,7 +22,7 @@ from jaxhom import checks
 from jaxhom.models.inputs import as_model, check_reward_values
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning import policy_iteration
-from jaxhom.planning.host_chains import HostModel, host_model, is_at_hand
+from jaxhom.planning.host_chains import HostModel, host_model
 from jaxhom.planning.plan import Plan
 from jaxhom.planning.plan_program import plan_in_program
 from jaxhom.planning.sensitivity import with_derivatives
@@ -75,11 +76,10 @@ def optimal_policy(
     """
     mdp = as_model(mdp)
     reward, is_batch = _reward_batch(mdp, reward)
-    if initial_value is None:
-        initial_value = jnp.zeros((reward.shape[0], mdp.num_states), mdp.dtype)
-    initial_value = checks.to_device(initial_value, mdp.dtype)
-    if initial_value.shape == (mdp.num_states,):
-        initial_value = jnp.broadcast_to(initial_value, (reward.shape[0], mdp.num_states))
+    xp = checks.arrays_of(mdp, reward, initial_value, tolerance)
+    initial_value = xp.asarray(0.0 if initial_value is None else initial_value, mdp.dtype)
+    if initial_value.shape in ((), (mdp.num_states,)):
+        initial_value = xp.broadcast_to(initial_value, (reward.shape[0], mdp.num_states))
     good = initial_value.shape == (reward.shape[0], mdp.num_states)
     checks.require_shape("initial_value", initial_value, f"(..., {mdp.num_states})", good)
     max_iterations = checks.require_count("max_iterations", max_iterations, least=0)
@@ -87,15 +87,17 @@ def optimal_policy(
     if not is_default:
         checks.require_positive("tolerance", tolerance, or_zero=True)
     else:
-        tolerance = (1e-10 if mdp.dtype == jnp.float64 else 1e-5) * _scale(reward)
-    tolerance = jnp.broadcast_to(checks.to_device(tolerance, mdp.dtype), reward.shape[:1])
-    inputs = jax.lax.stop_gradient((mdp, jnp.moveaxis(reward, 0, -1), initial_value.T, tolerance))
-    if is_at_hand(inputs):
+        tolerance = (1e-10 if mdp.dtype == jnp.float64 else 1e-5) * _scale(xp, reward)
+    tolerance = xp.broadcast_to(xp.asarray(tolerance, mdp.dtype), reward.shape[:1])
+    inputs = (mdp, xp.moveaxis(reward, 0, -1), initial_value.T, tolerance)
+    if xp is np:
         plan = _plan_at_hand(*inputs, max_iterations=max_iterations, is_polished=is_default)
     else:
-        plan = plan_in_program(*inputs, max_iterations=max_iterations, is_quick=False)[0]
-    plan = with_derivatives(mdp, reward, plan)
-    return plan if is_batch else jax.tree.map(lambda leaf: leaf[0], plan)
+        plan = plan_in_program(*jax.lax.stop_gradient(inputs), max_iterations=max_iterations, is_quick=False)[0]
+        plan = with_derivatives(mdp, reward, plan)
+    if not is_batch:
+        plan = jax.tree.map(lambda leaf: leaf[0], plan)
+    return jax.tree.map(checks.to_device, plan)
 
 
 def _reward_batch(mdp: MDP, reward) -> tuple[Float[Array, "B S A"], bool]:
@@ -114,11 +116,12 @@ def _reward_batch(mdp: MDP, reward) -> tuple[Float[Array, "B S A"], bool]:
     good = (is_pair and len(shape) in (2, 3)) or (is_state and len(shape) in (1, 2)) or is_wide
     checks.require_shape("reward", reward, expected, good)
     is_batch = len(shape) == 3 or (len(shape) == 2 and not is_pair)
-    reward = check_reward_values(mdp, reward, forbidden=-jnp.inf, may_forbid=True)
+    reward = check_reward_values(mdp, reward, forbidden=-np.inf, may_forbid=True)
+    xp = checks.arrays_of(reward, mdp.allowed)
     if not is_pair:
-        reward = jnp.broadcast_to(reward if is_wide else reward[..., None], (*shape[: len(shape) - is_wide], actions))
+        reward = xp.broadcast_to(reward if is_wide else reward[..., None], (*shape[: len(shape) - is_wide], actions))
         if mdp.restricts_actions:
-            reward = jnp.where(mdp.allowed, reward, -jnp.inf)
+            reward = xp.where(xp.asarray(mdp.allowed), reward, -np.inf)
     reward = reward if is_batch else reward[None]
     if not checks.is_traced(reward):
         has_action = np.isfinite(np.asarray(reward)).any(axis=-1)
@@ -129,19 +132,19 @@ def _reward_batch(mdp: MDP, reward) -> tuple[Float[Array, "B S A"], bool]:
     return reward, is_batch
 
 
-def _scale(reward: Float[Array, "B S A"]) -> Float[Array, " B"]:
+def _scale(xp: ModuleType, reward: Float[Array, "B S A"]) -> Float[Array, " B"]:
     """The largest |max_a r|; what is never chosen, such as a penalty of -1e6, does not count."""
-    best = jnp.abs(reward.max(axis=2)).max(axis=1)
-    every = jnp.where(jnp.isfinite(reward), jnp.abs(reward), 0.0).max(axis=(1, 2))
-    return jnp.where(best > 0, best, every)
+    best = xp.abs(reward.max(axis=2)).max(axis=1)
+    every = xp.where(xp.isfinite(reward), xp.abs(reward), 0.0).max(axis=(1, 2))
+    return xp.where(best > 0, best, every)
 
 
 def _plan_at_hand(mdp: MDP, reward, value, tolerance, *, max_iterations: int, is_polished: bool) -> Plan:
     """The plan for concrete arrays, batch last: by sweeps on the device, policy iteration on the host, or both."""
-    model, host_reward = host_model(mdp), np.asarray(reward, np.float64)
+    model, host_reward = host_model(mdp), reward.astype(np.float64)
     lanes = reward.shape[-1]
     if is_polished and max_iterations > 0 and model.plans_sooner(lanes):
-        expected = [model.expected_next_value(lane) for lane in np.asarray(value.T)]
+        expected = [model.expected_next_value(lane) for lane in value.T]
         start = host_reward + model.discount * np.stack(expected, axis=-1)
         return _improve_on_host(model, host_reward, _empty_plan(mdp, lanes), start, np.arange(lanes), max_iterations)
     plan, is_open = plan_in_program(mdp, reward, value, tolerance, max_iterations=max_iterations, is_quick=True)
@@ -161,7 +164,7 @@ def _empty_plan(mdp: MDP, lanes: int) -> Plan:
     pairs = (lanes, *mdp.allowed.shape)
     zeros, count = np.zeros(pairs, mdp.dtype), np.zeros(lanes, np.int32)
     return Plan(
-        policy=np.asarray(jnp.broadcast_to(uniform_policy(mdp), pairs)),
+        policy=np.broadcast_to(uniform_policy(mdp), pairs),
         value=zeros[..., 0],
         action_value=zeros,
         iterations=count,
@@ -199,5 +202,5 @@ def _improve_on_host(
         iterations[lane] += found.iterations
         limited = Status.ITERATION_LIMIT if found.iterations >= left else Status.STALLED
         status[lane] = Status.SOLVED if found.is_settled else limited
-    arrays = {name: checks.to_device(array, dtype) for name, array in fields.items()}
-    return plan.replace(**arrays, iterations=checks.to_device(iterations), status=checks.to_device(status))
+    fields = {name: array.astype(dtype) for name, array in fields.items()}
+    return plan.replace(**fields, iterations=iterations, status=status)

@@ -309,7 +309,7 @@ def _batch_last(array: Float[Array, "*B S A"]) -> Float[Array, "S A *B"]:
 def _validated(mdp: MDP, policy, reward, terminal, events):
     """Returns policy, reward, terminal [S] and events in the model's dtype, or raises."""
     policy = require_policy_shape(mdp, policy)
-    reward = check_reward(mdp, reward, policy.shape)
+    reward = checks.to_device(check_reward(mdp, reward, policy.shape))
     pair = (mdp.num_states, mdp.num_actions)
     terminal = jnp.zeros(pair[:1], bool) if terminal is None else checks.to_device(terminal)
     checks.require_shape("terminal", terminal, str(pair[:1]), terminal.shape == pair[:1])

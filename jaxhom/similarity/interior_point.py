@@ -15,10 +15,10 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxhom.programs import host_jit
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.newton import factorise
 from jaxhom.solvers.lane_queue import Solver, is_settled, run_lanes
-from jaxhom.solvers.programs import host_jit
 
 MAX_ITERATIONS = 60  # ten are usual
 _TO_BOUNDARY = 0.99  # of the way: points stay positive

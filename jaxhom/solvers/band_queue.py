@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
+from jaxhom.programs import host_jit
 from jaxhom.solvers.band_interior_point import Iterate, Lanes, Point, begin, run
 from jaxhom.solvers.band_system import BandSystem
 from jaxhom.solvers.lane_queue import num_cores
-from jaxhom.solvers.programs import host_jit
 
 if TYPE_CHECKING:
     from jaxtyping import Float

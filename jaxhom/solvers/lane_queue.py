@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.solvers.programs import host_jit
+from jaxhom.programs import host_jit
 
 _STOP_FRACTION = 0.25  # of the lanes: fewer and the host is asked more often, more and lanes wait
 _MAX_WORKERS = 8  # threads: more wait for Python

@@ -17,14 +17,17 @@ set. The primal weight omega is then moved towards the ratio of the distances tr
 A problem is a pytree with the methods of `Problem`. Every array has the lanes of the batch on its last axis, and
 every lane has its own anchor, weight, restarts and bounds. Answers are certificates: any feasible x gives an upper
 bound, any feasible y a lower one, and the best of each are kept with the points that prove them.
+
+A problem in arrays of NumPy is solved on the host, one lane at a time.
 """
 
 from typing import Protocol
 
 import chex
 import jax
-import jax.numpy as jnp
+import numpy as np
 
+from jaxhom.solvers.arrays import fori_loop, module_of
 from jaxhom.solvers.lane_queue import Solver, is_settled, run_lanes
 from jaxhom.solvers.projections import reduce_leading
 
@@ -93,10 +96,11 @@ class PDHGState:
 def init(problem: Problem, start: tuple[jax.Array, jax.Array] | None = None) -> PDHGState:
     """State at the problem's start, or at the given primal and dual points (a warm start)."""
     primal, dual = problem.start() if start is None else start
-    eta = 0.99 / jnp.maximum(_operator_norm(problem, primal), jnp.finfo(primal.dtype).tiny)
+    numpy = module_of(primal)
+    eta = 0.99 / numpy.maximum(_operator_norm(problem, primal), numpy.finfo(primal.dtype).tiny)
     lanes, dtype = primal.shape[-1], primal.dtype
-    zeros, count = jnp.zeros(lanes, dtype), jnp.zeros(lanes, jnp.int32)
-    infinity = jnp.full(lanes, jnp.inf, dtype)
+    zeros, count = numpy.zeros(lanes, dtype), numpy.zeros(lanes, numpy.int32)
+    infinity = numpy.full(lanes, numpy.inf, dtype)
     return PDHGState(
         primal=primal,
         dual=dual,
@@ -117,18 +121,19 @@ def init(problem: Problem, start: tuple[jax.Array, jax.Array] | None = None) -> 
 
 def step(problem: Problem, state: PDHGState) -> PDHGState:
     """Sixteen iterations, one look at the bounds, and a restart of the lanes that earned one."""
+    numpy = module_of(state.primal)
 
     def advance(k, carry):
         primal, dual, first_residual, _, _, _ = carry
         moved = state.replace(primal=primal, dual=dual)
         primal, dual, residual, mapped_primal, mapped_dual = _iterate(problem, moved, k)
         starts_round = (state.round_steps == 0) & (k == 0)
-        first_residual = jnp.where(starts_round, residual, first_residual)
+        first_residual = numpy.where(starts_round, residual, first_residual)
         return primal, dual, first_residual, residual, mapped_primal, mapped_dual
 
     start = (state.primal, state.dual, state.first_residual, state.last_residual)
-    primal, dual, first_residual, residual, mapped_primal, mapped_dual = jax.lax.fori_loop(
-        0, STEPS_PER_CHECK, advance, (*start, state.primal, state.dual)
+    primal, dual, first_residual, residual, mapped_primal, mapped_dual = fori_loop(
+        numpy, STEPS_PER_CHECK, advance, (*start, state.primal, state.dual)
     )
     state = state.replace(
         primal=primal,
@@ -143,7 +148,7 @@ def step(problem: Problem, state: PDHGState) -> PDHGState:
 
 def is_finished(state: PDHGState, tolerance, threshold, max_iterations) -> jax.Array:
     """[lanes]: settled, or out of iterations, or without a step length because the problem is not finite."""
-    is_lost = (state.steps >= max_iterations) | jnp.isnan(state.eta)
+    is_lost = (state.steps >= max_iterations) | module_of(state.eta).isnan(state.eta)
     return is_settled(state.lower, state.upper, tolerance, threshold) | is_lost
 
 
@@ -154,11 +159,15 @@ def solve(problem: Problem, state: PDHGState, *, tolerance, max_iterations: int 
     """Steps from a state until every lane's gap is within the tolerance or it is out of iterations.
 
     Args:
-      problem: the problem.
+      problem: the problem; in arrays of NumPy of one lane.
       state: from `init` or a former call.
       tolerance: scalar or [lanes], the gap to reach.
       max_iterations: per lane.
     """
+    if module_of(state.primal) is np:
+        while not is_finished(state, tolerance, np.nan, max_iterations).all():
+            state = step(problem, state)
+        return state
     return run_lanes(SOLVER, problem, state, tolerance=tolerance, max_iterations=max_iterations)[0]
 
 
@@ -176,38 +185,39 @@ def _iterate(problem: Problem, state: PDHGState, k):
     pull = pull.astype(state.eta.dtype)
     primal = (1.0 - pull) * (mapped_primal + moved_primal) + pull * state.anchor_primal
     dual = (1.0 - pull) * (mapped_dual + moved_dual) + pull * state.anchor_dual
-    return primal, dual, jnp.sqrt(residual), mapped_primal, mapped_dual
+    return primal, dual, module_of(residual).sqrt(residual), mapped_primal, mapped_dual
 
 
 def _update_bounds(problem: Problem, state: PDHGState, primal, dual) -> PDHGState:
     lower, upper = problem.bounds(primal, dual, problem.forward(primal), problem.adjoint(dual))
     better_lower, better_upper = lower > state.lower, upper < state.upper
+    numpy = module_of(primal)
     return state.replace(
-        lower=jnp.where(better_lower, lower, state.lower),
-        upper=jnp.where(better_upper, upper, state.upper),
-        best_primal=jnp.where(better_upper, primal, state.best_primal),
-        best_dual=jnp.where(better_lower, dual, state.best_dual),
+        lower=numpy.where(better_lower, lower, state.lower),
+        upper=numpy.where(better_upper, upper, state.upper),
+        best_primal=numpy.where(better_upper, primal, state.best_primal),
+        best_dual=numpy.where(better_lower, dual, state.best_dual),
     )
 
 
 def _restart(state: PDHGState, residual, primal, dual) -> PDHGState:
     """Moves the anchor of the lanes whose residual has fallen enough, or whose round has become long."""
-    first = state.first_residual
+    numpy, first = module_of(primal), state.first_residual
     is_due = (
         (residual <= _SUFFICIENT_DECAY * first)
         | ((residual <= _NECESSARY_DECAY * first) & (residual > state.last_residual))
         | (state.round_steps >= _ARTIFICIAL_FRACTION * state.steps)
     )
-    moved_primal = jnp.sqrt(_square_norm(primal - state.anchor_primal))
-    moved_dual = jnp.sqrt(_square_norm(dual - state.anchor_dual))
-    tiny = jnp.finfo(moved_primal.dtype).tiny
-    change = jnp.sqrt(jnp.maximum(moved_dual, tiny) / jnp.maximum(moved_primal, tiny) / state.weight)
+    moved_primal = numpy.sqrt(_square_norm(primal - state.anchor_primal))
+    moved_dual = numpy.sqrt(_square_norm(dual - state.anchor_dual))
+    tiny = numpy.finfo(moved_primal.dtype).tiny
+    change = numpy.sqrt(numpy.maximum(moved_dual, tiny) / numpy.maximum(moved_primal, tiny) / state.weight)
     # Bounded: where one side has arrived and no longer moves, the weight still turns to the other.
-    change = jnp.clip(change, 1.0 / _MAX_WEIGHT_CHANGE, _MAX_WEIGHT_CHANGE)
-    weight = jnp.clip(state.weight * change, 1.0 / _MAX_WEIGHT, _MAX_WEIGHT)
+    change = numpy.clip(change, 1.0 / _MAX_WEIGHT_CHANGE, _MAX_WEIGHT_CHANGE)
+    weight = numpy.clip(state.weight * change, 1.0 / _MAX_WEIGHT, _MAX_WEIGHT)
 
     def choose(new, old):
-        return jnp.where(is_due, new, old)
+        return numpy.where(is_due, new, old)
 
     return state.replace(
         primal=choose(primal, state.primal),
@@ -216,7 +226,7 @@ def _restart(state: PDHGState, residual, primal, dual) -> PDHGState:
         anchor_dual=choose(dual, state.anchor_dual),
         weight=choose(weight, state.weight),
         round_steps=choose(0, state.round_steps),
-        last_residual=choose(jnp.inf, residual),
+        last_residual=choose(numpy.inf, residual),
     )
 
 
@@ -227,17 +237,17 @@ def _square_norm(array: jax.Array) -> jax.Array:
 
 def _operator_norm(problem: Problem, like: jax.Array) -> jax.Array:
     """|K|_2 per lane: a power iteration with a margin, where that is below the problem's own bound."""
-    entries = like.size // like.shape[-1]
+    numpy, entries = module_of(like), like.size // like.shape[-1]
     # A fixed vector with no symmetry to be orthogonal to anything by accident.
-    start = 1.0 + 0.5 * jnp.sin(jnp.arange(entries, dtype=like.dtype) ** 2)
-    start = jnp.broadcast_to(start.reshape((*like.shape[:-1], 1)), like.shape)
+    start = 1.0 + 0.5 * numpy.sin(numpy.arange(entries, dtype=like.dtype) ** 2)
+    start = numpy.broadcast_to(start.reshape((*like.shape[:-1], 1)), like.shape)
 
     def power(_, carry):
         vector, _ = carry
         product = problem.adjoint(problem.forward(vector))
-        square = jnp.sqrt(_square_norm(product))
-        return product / jnp.maximum(square, jnp.finfo(like.dtype).tiny), square
+        square = numpy.sqrt(_square_norm(product))
+        return product / numpy.maximum(square, numpy.finfo(like.dtype).tiny), square
 
-    start = start / jnp.sqrt(_square_norm(start))
-    _, square = jax.lax.fori_loop(0, 20, power, (start, jnp.zeros(like.shape[-1], like.dtype)))
-    return jnp.minimum(1.1 * jnp.sqrt(square), problem.norm_bound())
+    start = start / numpy.sqrt(_square_norm(start))
+    _, square = fori_loop(numpy, 20, power, (start, numpy.zeros(like.shape[-1], like.dtype)))
+    return numpy.minimum(1.1 * numpy.sqrt(square), problem.norm_bound())

@@ -16,8 +16,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
-import numpy as np
+from jaxhom.solvers.arrays import module_of
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
@@ -33,7 +32,7 @@ def longest_step(
       most: where nothing is in the way.
       to_boundary: share of the way to the first boundary, below 1 for points that are to stay positive.
     """
-    numpy = _module_of(pairs[0][0])
+    numpy = module_of(pairs[0][0])
     steps = [_first_boundary(numpy, value, change) for value, change in pairs]
     first = numpy.stack(steps).min() if len(steps) > 1 else steps[0]
     return numpy.minimum(to_boundary * first, most)
@@ -56,7 +55,7 @@ def mehrotra_target(
       least: smallest factor; without one, products that nearly vanish leave the next step no room.
       most: largest factor. Above 1 only where points are not feasible yet, and products may have to grow first.
     """
-    return mean * _module_of(mean).clip(left**3, least, most)
+    return mean * module_of(mean).clip(left**3, least, most)
 
 
 def towards_centre(products: Float[Array, " n"], target: Float[Array, ""], even: float) -> Float[Array, " n"]:
@@ -64,10 +63,6 @@ def towards_centre(products: Float[Array, " n"], target: Float[Array, ""], even:
 
     Large ones are corrected by no more than the largest product that is wanted: more would undo the step.
     """
-    numpy = _module_of(products)
+    numpy = module_of(products)
     low, high = even * target, target / even
     return numpy.maximum(numpy.clip(products, low, high) - products, -high)
-
-
-def _module_of(array) -> ModuleType:
-    return np if isinstance(array, np.ndarray | np.generic | float) else jnp

@@ -4,7 +4,8 @@ Each projection finds a threshold by Newton's method on a convex piecewise linea
 lower bounds (all entries above the threshold; the largest entry alone), which is exact after a few steps. On XLA's CPU
 backend this is many times faster than the usual sort, given two things. Sums over leading axes are written out,
 because a `reduce` whose kept axis is the last is not vectorised. And the steps stand in a loop of their own: outside
-one, XLA fuses whatever produced the argument into every step and computes it again.
+one, XLA fuses whatever produced the argument into every step and computes it again. Arrays of NumPy are projected in
+NumPy.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from jaxhom.solvers.arrays import module_of, while_loop
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
@@ -27,6 +31,8 @@ def reduce_leading(
     array: Float[Array, "..."], axes: tuple[int, ...], operation: Callable = operator.add
 ) -> Float[Array, "..."]:
     """Reduces over `axes`, as written-out chains of at most 32 terms at a time; the last axis by a plain reduction."""
+    if module_of(array) is np:
+        return array.sum(axis=axes) if operation is operator.add else array.max(axis=axes)
     for axis in sorted(axes, reverse=True):
         array = _reduce_axis(array, axis, operation)
     return array
@@ -53,8 +59,9 @@ def project_simplex(point: Float[Array, "..."], total: float = 1.0, *, axis: int
     """argmin_x |x - point|^2 subject to x >= 0, sum(x, axis) = total."""
 
     def project(point):
-        threshold = _threshold(point, total, (axis,))
-        return jnp.maximum(point - jnp.expand_dims(threshold, axis), 0.0)
+        numpy = module_of(point)
+        threshold = (_root if numpy is np else _threshold)(point, total, (axis,))
+        return numpy.maximum(point - numpy.expand_dims(threshold, axis), 0.0)
 
     return _compute_once(project, point)
 
@@ -63,9 +70,10 @@ def project_l1_ball(point: Float[Array, "..."], *, axes: tuple[int, ...]) -> Flo
     """argmin_y |y - point|^2 subject to sum(|y|, axes) <= 1."""
 
     def project(point):
-        size = jnp.abs(point)
-        threshold = jnp.maximum(_threshold(size, 1.0, axes), 0.0)
-        return jnp.sign(point) * jnp.maximum(size - jnp.expand_dims(threshold, axes), 0.0)
+        numpy = module_of(point)
+        size = numpy.abs(point)
+        threshold = numpy.maximum((_root if numpy is np else _threshold)(size, 1.0, axes), 0.0)
+        return numpy.sign(point) * numpy.maximum(size - numpy.expand_dims(threshold, axes), 0.0)
 
     return _compute_once(project, point)
 
@@ -75,37 +83,42 @@ def _compute_once(project, point: jax.Array) -> jax.Array:
 
     The branch is always taken, but XLA does not know: the operand of a conditional must exist as an array.
     """
+    if module_of(point) is np:
+        return project(point)
     is_usual = point.ravel()[0] != -jnp.inf  # NaN is usual: it must not spoil the lanes beside it
     return jax.lax.cond(is_usual, project, lambda point: jnp.full_like(point, jnp.nan), point)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def _threshold(point: jax.Array, total: float, axes: tuple[int, ...]) -> jax.Array:
+def _root(point: jax.Array, total: float, axes: tuple[int, ...]) -> jax.Array:
     """The root t of sum(max(point - t, 0), axes) = total, from below."""
+    numpy = module_of(point)
     count = 1
     for axis in axes:
         count *= point.shape[axis]
     mean_excess = (reduce_leading(point, axes) - total) / count
-    largest = reduce_leading(point, axes, jnp.maximum)
-    start = jnp.maximum(mean_excess, largest - total)
-    rounding = 4.0 * jnp.finfo(point.dtype).eps * (1.0 + jnp.abs(start))
+    largest = reduce_leading(point, axes, numpy.maximum)
+    start = numpy.maximum(mean_excess, largest - total)
+    rounding = 4.0 * numpy.finfo(point.dtype).eps * (1.0 + numpy.abs(start))
 
     def keep_going(carry):
         step, _, excess = carry
-        return (step < count) & jnp.any(excess > rounding)
+        return (step < count) & numpy.any(excess > rounding)
 
     def newton(carry):
         step, threshold, change = carry
         is_open = change > rounding  # a root that is found stays: an answer does not depend on the lanes beside it
-        excess = point - jnp.expand_dims(threshold, axes)
+        excess = point - numpy.expand_dims(threshold, axes)
         above = (excess > 0).astype(point.dtype)
-        number = jnp.maximum(reduce_leading(above, axes), 1.0)
-        mass = reduce_leading(jnp.maximum(excess, 0.0), axes)
-        change = jnp.where(is_open, (mass - total) / number, 0.0)
+        number = numpy.maximum(reduce_leading(above, axes), 1.0)
+        mass = reduce_leading(numpy.maximum(excess, 0.0), axes)
+        change = numpy.where(is_open, (mass - total) / number, 0.0)
         return step + 1, threshold + change, change
 
-    first = (jnp.zeros((), jnp.int32), start, jnp.full_like(start, jnp.inf))
-    return jax.lax.while_loop(keep_going, newton, first)[1]
+    first = (numpy.zeros((), numpy.int32), start, numpy.full_like(start, numpy.inf))
+    return while_loop(numpy, keep_going, newton, first)[1]
+
+
+_threshold = jax.custom_jvp(_root, nondiff_argnums=(1, 2))
 
 
 @_threshold.defjvp

@@ -101,7 +101,7 @@ def test_residual_and_bounds_hold_at_every_tolerance(name, tolerance):
 @pytest.mark.parametrize("max_iterations", [0, 5])
 def test_a_plan_that_is_cut_short_says_so_and_its_bound_holds(max_iterations):
     case, reward = small_models.case("restart"), reward_of("restart")
-    plan = optimal_policy(case.mdp, reward, max_iterations=max_iterations)
+    plan = optimal_policy(case.mdp, reward, tolerance=1e-10, max_iterations=max_iterations)  # by sweeps
     assert plan.iterations == max_iterations
     assert plan.residual > 1e-3
     residual = bellman_residual(case, reward, np.asarray(plan.value))
@@ -229,9 +229,9 @@ def test_a_square_reward_is_one_reward():
 
 def test_a_former_value_saves_the_sweeps():
     case, reward = small_models.case("restart"), reward_of("restart")
-    cold = optimal_policy(case.mdp, reward)
+    cold = optimal_policy(case.mdp, reward, tolerance=1e-10)  # by sweeps
     assert cold.iterations > 20
-    warm = optimal_policy(case.mdp, reward, initial_value=cold.value)
+    warm = optimal_policy(case.mdp, reward, tolerance=1e-10, initial_value=cold.value)
     assert warm.iterations <= 2
     rewards = np.stack([reward] * 3)
     for start in (cold.value, jnp.stack([cold.value, cold.value + 1, cold.value])):

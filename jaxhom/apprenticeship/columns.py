@@ -32,6 +32,7 @@ from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found, LPALMethod
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.chain_solver import is_solved_by_lu
+from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.solvers.lane_queue import num_cores
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def solve_by_columns(request: Request, *, gives_up: bool = False) -> Found:
       request: the lanes.
       gives_up: whether lanes that do not get on end: another method will take them.
     """
-    with Columns(request) as columns:
+    with one_blas_thread(), Columns(request) as columns:  # all cores are in use
         columns.play(range(len(request.lanes)), gives_up=gives_up)
         return columns.found()
 

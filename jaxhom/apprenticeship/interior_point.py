@@ -11,6 +11,7 @@ few lanes, and all other models, go lane by lane on the host (`sparse_interior_p
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -32,6 +33,7 @@ from jaxhom.planning.flow_matrix import flow_matrix
 from jaxhom.solvers import band_interior_point
 from jaxhom.solvers.band_queue import solve_lanes
 from jaxhom.solvers.band_system import BandSystem, band_system
+from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.solvers.block_tridiagonal import Blocks
 from jaxhom.solvers.normal_equations import Rows
 from jaxhom.solvers.sparse_interior_point import solve, start
@@ -44,6 +46,7 @@ DEFAULT_STEPS = 100
 _MOST_WORK = 3e9  # multiplications of a step: grid100 (bench.instances) takes 4.1 s either way
 _MOST_COMPILED_WORK = 4.0  # of the host's: where features are eliminated before the flow, its factor may be smaller
 _MANY_LANES = 8  # fewer do not pay for compiling, three seconds; of 32 lanes of grid48 each takes half as long
+_SMALL_WORK = 1e8  # multiplications of a step up to which threads of BLAS wait for one another
 _MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals: certificates are made of what is left
 
 
@@ -173,7 +176,8 @@ def solve_by_interior_point(request: Request) -> Found:
         if points is None:
             points = []
             for lane in zip(request.expectations, request.tolerance, limit, strict=True):
-                points.append(program.solve(*lane[:2], max_iterations=lane[2]))
+                with one_blas_thread() if program.work <= _SMALL_WORK else contextlib.nullcontext():
+                    points.append(program.solve(*lane[:2], max_iterations=lane[2]))
                 bar.update(1)
     x, weights, value = (np.stack([getattr(point, name) for point in points]) for name in ("x", "weights", "value"))
     steps = np.array([point.steps for point in points])

@@ -22,7 +22,7 @@ from jaxhom.similarity import interior_point
 from jaxhom.similarity.free_bounds import lower_bounds_without_iterations, upper_bounds_without_iterations
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import certified_bounds
-from jaxhom.similarity.host_interior_point import solve_on_host
+from jaxhom.similarity.host_interior_point import seconds_on_host, solve_on_host
 from jaxhom.solvers import pdhg
 from jaxhom.solvers.lane_queue import is_settled, solve_many
 from jaxhom.status import Record, Status
@@ -42,7 +42,6 @@ NOISE = 32.0  # times eps: closer than that an iteration does not come
 _INTERIOR_BYTES = 2 * 2**20  # of a batch's normal matrices: a core's own cache
 _TIGHT = 1e-3  # wider gaps PDHG closes sooner
 _COMPILING = 2.0  # seconds that a program takes at least to compile
-_HOST_SECONDS, _HOST_GROWTH = 2e-6, 1.7  # of a pair on the host, times (n m)^1.7: 0.5 ms for five states, 120 for 25
 _MAP_LANES = 8  # maps are asked for a few at a time
 
 
@@ -111,8 +110,8 @@ def choose_method(n: int, m: int, dtype, goal: Goal) -> str:
 
 def is_small_work(problem: HomomorphismProblem) -> bool:
     """Whether the host is done with a problem before its program would be compiled."""
-    n, m, count = len(problem.source), len(problem.target), problem.source.shape[-1]
-    return max(n, m) <= MAX_INTERIOR_SIZE and count * _HOST_SECONDS * (n * m) ** _HOST_GROWTH <= _COMPILING
+    sizes = np.asarray(problem.source_size), np.asarray(problem.target_size)
+    return max(map(np.max, sizes)) <= MAX_INTERIOR_SIZE and seconds_on_host(*sizes).sum() <= _COMPILING
 
 
 def bracket_errors(

@@ -43,7 +43,7 @@ class Certificate:
       dtype: of the problem's models.
     """
 
-    def __init__(self, problem: HomomorphismProblem, lanes: slice):
+    def __init__(self, problem: HomomorphismProblem, lanes: slice | np.ndarray):
         arrays = (problem.source, problem.target, problem.source_labels, problem.target_labels)
         self.models = tuple(None if a is None else _lanes_first(a[..., lanes]) for a in arrays)
         self.dtype, self._anchored = problem.source.dtype, problem.anchored

@@ -1,5 +1,7 @@
 """LP (9) on the host: against HiGHS, with padding, labels and thresholds; and which work is small enough for it."""
 
+import dataclasses
+
 import numpy as np
 import oracles
 import pytest
@@ -125,3 +127,27 @@ def test_many_pairs_and_large_models_are_compiled():
     assert brackets.is_small_work(sizes(25, 25, 4))
     assert not brackets.is_small_work(sizes(25, 25, 400))
     assert not brackets.is_small_work(sizes(60, 4, 1))
+
+
+def test_pairs_of_mixed_sizes_are_solved_as_if_alone(rng):
+    """Batches of similar sizes, on all cores: every pair gets what it gets by itself, in its place."""
+    sizes = [(1, 1), (2, 7), (9, 3), (4, 4), (9, 9), (3, 8), (5, 2), (9, 8)]
+    alone, lanes = [], []
+    for n, m in sizes:
+        source, target = random_models(rng, 1, n, 3), random_models(rng, 1, m, 3)
+        alone.append(solve(source, target))
+        lanes.append((padded(source, 9), padded(target, 9)))
+    source, target = map(np.concatenate, zip(*lanes, strict=True))
+    together = dataclasses.replace(
+        problem(source, target),
+        source_size=np.array([n for n, _ in sizes]),
+        target_size=np.array([m for _, m in sizes]),
+    )
+    seen = []
+    found = solve_on_host(together, 1e-7, np.nan, seen.append)
+    assert sum(seen) == len(sizes) and len(seen) > 1
+    np.testing.assert_allclose(found.lower, np.concatenate([one.lower for one in alone]), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.upper, np.concatenate([one.upper for one in alone]), rtol=0, atol=1e-7)
+    for k, (n, m) in enumerate(sizes):
+        np.testing.assert_allclose(found.maps[k, :n, :m].sum(axis=1), 1.0, rtol=0, atol=1e-12)
+        assert not found.maps[k, n:].any() and not found.maps[k, :, m:].any()

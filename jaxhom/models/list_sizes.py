@@ -15,6 +15,7 @@ import numpy as np
 from jaxhom import checks
 
 PIECE = 16  # items of a row that are added up in one go
+FEW_PIECES = 8  # of all rows, that nobody feels: a fraction of a microsecond
 _EXACT_WIDTH = 10  # up to here a term more in every row is felt
 _EXACT_DEGREE = 4  # edges per state up to which they are rounded to powers of two: grids with walls have two to four
 
@@ -69,14 +70,14 @@ def rounded_width(width: int) -> int:
     return 12 if width <= 12 else -(-width // PIECE) * PIECE
 
 
-def rounded_count(count: int, beside: int = 0) -> int:
-    """More by at most an eighth, or by a sixteenth of `beside`, which is read all the same, if that is more.
+def rounded_count(count: int, beside: int = 0, least: int = 1) -> int:
+    """More by at most an eighth, by a sixteenth of `beside`, which is read all the same, or by less than `least`.
 
     0 stays 0: programs leave out what is not there.
     """
     if count == 0:
         return 0
-    step = max(_power_below(count) // 8, _power_below(beside // 16), 1)
+    step = max(_power_below(count) // 8, _power_below(beside // 16), least)
     return -(-count // step) * step
 
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.models.list_sizes import PIECE, RowSize, rounded_count, rounded_width
+from jaxhom.models.list_sizes import FEW_PIECES, PIECE, RowSize, rounded_count, rounded_width
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def row_size(counts: Int[np.ndarray, " R"]) -> RowSize:
     """The shape of rows with so many items each, rounded up."""
     width = rounded_width(narrow_width(counts))
     pieces = -(-np.maximum(counts - width, 0) // PIECE)
-    return RowSize(width, rounded_count(int(pieces.sum()), counts.size * width // PIECE))
+    return RowSize(width, rounded_count(int(pieces.sum()), counts.size * width // PIECE, FEW_PIECES))
 
 
 def sum_rows(index: PaddedRows, weight: PaddedRows, values: Float[Array, "S *B"]) -> Float[Array, "R *B"]:

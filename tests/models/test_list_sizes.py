@@ -30,6 +30,7 @@ def test_counts(beside):
     assert (rounded >= counts).all()
     assert (rounded - counts <= np.maximum(counts / 8, beside / 16)).all()
     assert (np.diff(rounded) >= 0).all()
+    assert {rounded_count(count, least=8) for count in range(1, 9)} == {8}
     assert len(np.unique(rounded)) <= 8 * np.log2(3000)
 
 

@@ -30,6 +30,7 @@ from jaxhom.models.demonstrations import (
 )
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
 from jaxhom.models.mdp import MDP
+from jaxhom.models.stacking import stack_models
 from jaxhom.planning.occupancy import feature_expectations, occupancy, policy_value
 from jaxhom.planning.optimal import Plan, optimal_policy
 from jaxhom.planning.trials import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
@@ -82,5 +83,6 @@ __all__ = [
     "sample_weights",
     "soft_homomorphism",
     "soft_local_homomorphism",
+    "stack_models",
     "uniform_elsewhere",
 ]

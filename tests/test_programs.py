@@ -121,6 +121,9 @@ def cases() -> dict[str, Case]:
         "homomorphism_map": Case(
             lambda source: jaxhom.homomorphism_map(source, models[1], regularization=0.1), models[0]
         ),
+        "stack_models": Case(
+            lambda scale: jaxhom.stack_models([mdp, mdp.replace(features=scale * mdp.features)]).features, one
+        ),
         "uniform_elsewhere": Case(
             lambda walks: jaxhom.uniform_elsewhere(mdp, walks),
             walks,

@@ -29,7 +29,7 @@ def factor_entries(mdp: MDP) -> tuple[Blocks, int]:
     """The order of the states for a model's factor, and how many numbers that takes."""
     flow = abs(flow_matrix(mdp))
     pattern = flow.toarray() @ flow.toarray().T if mdp.is_dense else flow @ flow.T
-    blocks = order_in_blocks(scipy.sparse.csr_array(pattern))
+    blocks = order_in_blocks(scipy.sparse.csr_array(pattern)).rounded()
     return blocks, 2 * blocks.count * blocks.size**2
 
 

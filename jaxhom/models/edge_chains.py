@@ -14,18 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.models.padded_rows import MAX_UNROLLED_ACTIONS, PaddedRows, gather_sum, pad_rows, sum_rows
+from jaxhom.models.list_sizes import ListSizes, rounded_edges
+from jaxhom.models.padded_rows import MAX_UNROLLED_ACTIONS, PaddedRows, gather_sum, pad_rows, row_size, sum_rows
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, Float, Int
+    from jaxtyping import Array, Bool, Float, Int
 
 
 class Edges(Record):
     """The graph of a model in the successor layout.
 
     Attributes:
-      source, target: int32 [E], the states that each edge links, in ascending order.
+      source, target: int32 [E], the states that each edge links, in ascending order; then 0, 0 of edges to which no
+        action contributes, since E is rounded up (`list_sizes`).
       entry: int32 [E, A], the flat (s, a, slot) entry of `probability` that action a contributes to the edge; S A N
         where it contributes nothing.
       outgoing: the edges of every state s; E as sentinel. incoming: those of every s'.
@@ -97,23 +99,36 @@ class ActionChains(Record):
         return [one.at[self.wide_row].add(more) for one, more in zip(expected, beyond, strict=True)]
 
 
-def find_edges(next_state: Int[np.ndarray, "S A N"], probability: Float[np.ndarray, "S A N"]) -> Edges:
-    """The edges of successors without repetitions in a row; on the host."""
+def find_edges(
+    next_state: Int[np.ndarray, "S A N"], used: Bool[np.ndarray, "S A N"], sizes: ListSizes | None = None
+) -> Edges:
+    """The edges of successors without repetitions in a row; on the host.
+
+    Args:
+      next_state: [S, A, N].
+      used: bool [S, A, N], the slots that count.
+      sizes: of the arrays, large enough; rounded up from what the model needs if None.
+    """
     num_states, num_actions, slots = next_state.shape
-    used = np.flatnonzero(probability > 0)
-    pair = used // slots
-    key = (pair // num_actions) * num_states + next_state.ravel()[used]
+    (entries,) = np.nonzero(used.ravel())
+    pair = entries // slots
+    key = (pair // num_actions) * num_states + next_state.ravel()[entries]
     keys, edge = np.unique(key, return_inverse=True)
     source, target = np.divmod(keys, num_states)
-    entry = np.full((len(keys), num_actions), next_state.size, np.int32)
-    entry[edge, pair % num_actions] = used
-    number = np.arange(len(keys))
+    if sizes is None:
+        outgoing, incoming = (row_size(np.bincount(ends, minlength=num_states)) for ends in (source, target))
+        count = rounded_edges(len(keys), num_states, outgoing)
+    else:
+        outgoing, incoming, count = sizes.outgoing, sizes.incoming, sizes.edges
+    entry = np.full((count, num_actions), next_state.size, np.int32)
+    entry[edge, pair % num_actions] = entries
+    number, padding = np.arange(len(keys)), (0, count - len(keys))
     return Edges(
-        source=source.astype(np.int32),
-        target=target.astype(np.int32),
+        source=np.pad(source.astype(np.int32), padding),
+        target=np.pad(target.astype(np.int32), padding),
         entry=entry,
-        outgoing=pad_rows(number, source, num_states, len(keys)),
-        incoming=pad_rows(number, target, num_states, len(keys)),
+        outgoing=pad_rows(number, source, num_states, count, outgoing),
+        incoming=pad_rows(number, target, num_states, count, incoming),
     )
 
 

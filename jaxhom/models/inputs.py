@@ -23,6 +23,8 @@ def as_model(mdp: Any) -> MDP:
     model = getattr(mdp, "mdp", mdp)
     if not isinstance(model, MDP):
         raise ValueError(f"a jaxhom.MDP is needed, or what has one as .mdp, got {type(mdp).__name__}")
+    if getattr(model.discount, "ndim", 0):
+        raise ValueError(f"this is a stack of {len(model.discount)} models: map the function with jax.vmap over it")
     return model
 
 

@@ -189,6 +189,7 @@ class MDP(Record):
 
     def _figures(self) -> dict:
         return {
+            "batch": self.probability.shape[0] if self.probability.ndim > 3 else None,  # of `stack_models`
             "num_states": self.num_states,
             "num_actions": self.num_actions,
             "num_features": self.num_features,
@@ -201,12 +202,12 @@ class MDP(Record):
     @property
     def num_states(self) -> int:
         """S."""
-        return self.probability.shape[0]
+        return self.probability.shape[-3]
 
     @property
     def num_actions(self) -> int:
         """A."""
-        return self.probability.shape[1]
+        return self.probability.shape[-2]
 
     @property
     def num_features(self) -> int:

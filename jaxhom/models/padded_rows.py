@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom.models.list_sizes import FEW_PIECES, PIECE, RowSize, rounded_count, rounded_width
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Float, Int, Num
 
-_MAX_UNROLL = 16  # terms that are written out; longer sums are loops over blocks of so many
+_MAX_UNROLL = PIECE  # terms that are written out; longer sums are loops over blocks of so many
 MAX_UNROLLED_ACTIONS = 16  # more are not written out one by one: programs would take minutes to compile
 
 
@@ -26,7 +27,7 @@ class PaddedRows(Record):
 
     Attributes:
       narrow: [R, W, ...], the first W items of every row; a sentinel where a row is shorter.
-      wide_row: int32 [J], the rows that go on; once for every V further items.
+      wide_row: int32 [J], the rows that go on; once for every V further items. J is rounded up (`list_sizes`).
       wide: [J, V, ...], those items; the sentinel where a row is shorter.
     """
 
@@ -34,28 +35,49 @@ class PaddedRows(Record):
     wide_row: Int[Array, " J"]
     wide: Num[Array, "J V *X"]
 
+    @property
+    def size(self) -> RowSize:
+        """W and J."""
+        return RowSize(self.narrow.shape[1], self.wide.shape[0])
+
     def lookup(self, table: Num[Array, "I *X"]) -> PaddedRows:
         """The rows with every item i replaced by table[i]."""
         return PaddedRows(narrow=table[self.narrow], wide_row=self.wide_row, wide=table[self.wide])
 
 
-def pad_rows(items: Int[np.ndarray, " I"], owner: Int[np.ndarray, " I"], num_rows: int, sentinel: int) -> PaddedRows:
-    """Lists, per row, the items that it owns, in their order; owners in [0, num_rows). On the host."""
+def pad_rows(
+    items: Int[np.ndarray, " I"],
+    owner: Int[np.ndarray, " I"],
+    num_rows: int,
+    sentinel: int,
+    size: RowSize | None = None,
+) -> PaddedRows:
+    """Lists, per row, the items that it owns, in their order; owners in [0, num_rows). On the host.
+
+    Args:
+      items: [I].
+      owner: int [I], the row of each.
+      num_rows: R.
+      sentinel: what stands where there is no item.
+      size: of the arrays, large enough; that of `row_size` if None. Pieces that no row needs hold sentinels and belong
+        to the last row.
+    """
     order = np.argsort(owner, kind="stable")
     items, owner = items[order], owner[order]
     counts = np.bincount(owner, minlength=num_rows)
+    width, num_pieces = row_size(counts) if size is None else size
     place = np.arange(len(items)) - (np.cumsum(counts) - counts)[owner]
-    width = narrow_width(counts)
     narrow = np.full((num_rows, width), sentinel, np.int32)
     inside = place < width
     narrow[owner[inside], place[inside]] = items[inside]
-    pieces = -(-np.maximum(counts - width, 0) // _MAX_UNROLL)  # a few rows may be far longer than the other long ones
+    pieces = -(-np.maximum(counts - width, 0) // PIECE)  # a few rows may be far longer than the other long ones
     first_piece = np.cumsum(pieces) - pieces
-    wide = np.full((pieces.sum(), _MAX_UNROLL), sentinel, np.int32)
-    piece, slot = np.divmod(place[~inside] - width, _MAX_UNROLL)
+    wide = np.full((num_pieces, PIECE), sentinel, np.int32)
+    piece, slot = np.divmod(place[~inside] - width, PIECE)
     wide[first_piece[owner[~inside]] + piece, slot] = items[~inside]
-    wide_row = np.repeat(np.arange(num_rows), pieces)
-    return PaddedRows(narrow=narrow, wide_row=wide_row.astype(np.int32), wide=wide)
+    wide_row = np.full(num_pieces, num_rows - 1, np.int32)
+    wide_row[: pieces.sum()] = np.repeat(np.arange(num_rows), pieces)
+    return PaddedRows(narrow=narrow, wide_row=wide_row, wide=wide)
 
 
 def narrow_width(counts: Int[np.ndarray, " R"]) -> int:
@@ -66,6 +88,13 @@ def narrow_width(counts: Int[np.ndarray, " R"]) -> int:
     cost = counts.size * widths + beyond * (longest - widths)
     best = int(np.argmin(cost))
     return int(widths[best]) if 2 * cost[best] < cost[-1] else longest
+
+
+def row_size(counts: Int[np.ndarray, " R"]) -> RowSize:
+    """The shape of rows with so many items each, rounded up."""
+    width = rounded_width(narrow_width(counts))
+    pieces = -(-np.maximum(counts - width, 0) // PIECE)
+    return RowSize(width, rounded_count(int(pieces.sum()), counts.size * width // PIECE, FEW_PIECES))
 
 
 def sum_rows(index: PaddedRows, weight: PaddedRows, values: Float[Array, "S *B"]) -> Float[Array, "R *B"]:

@@ -8,7 +8,7 @@ pay for them, so they are kept apart. The forward map reads the same numbers thr
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jaxhom import checks
 from jaxhom.models import edge_chains
 from jaxhom.models.dynamics import Dynamics
 from jaxhom.models.edge_chains import ActionChains, Edges, OneLane, PolicyChain
+from jaxhom.models.list_sizes import ListSizes, rounded_count, rounded_width
 from jaxhom.models.padded_rows import MAX_UNROLLED_ACTIONS, PaddedRows, gather_sum, narrow_width, pad_rows
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ class SuccessorLists(Dynamics):
     """T as lists of successors. Build it with `SuccessorLists.from_host`.
 
     Attributes:
-      wide_pairs: int32 [J], flat (s, a) indices of the pairs with successors beyond the narrow width.
+      wide_pairs: int32 [J], flat (s, a) indices of the pairs with successors beyond the narrow width; then S A, since J
+        is rounded up (`list_sizes`).
       wide_successors: int32 [N], the successors of all these pairs, if they are the same (restarts); else None.
       predecessors: per state s', the flat (s, a, slot) entries that lead to it.
       edges: the graph's edges, for the chains of policies.
@@ -50,23 +52,32 @@ class SuccessorLists(Dynamics):
         cls, next_state: Int[np.ndarray, "S A N"], probability: Float[np.ndarray, "S A N"], dtype: DTypeLike
     ) -> SuccessorLists:
         """The lists, with what the maps look up in them; rows ascend and repeat no successor."""
-        num_states, _, slots = next_state.shape
-        counts = (probability > 0).sum(axis=-1).ravel()
-        width = narrow_width(counts)
-        wide_pairs = np.flatnonzero(counts > width).astype(np.int32)
-        lists = next_state.reshape(-1, slots)[wide_pairs]
-        is_shared = len(lists) > 0 and (lists == lists[0]).all()
-        entry = np.flatnonzero(probability > 0)
-        predecessors = pad_rows(entry, next_state.ravel()[entry], num_states, next_state.size)
-        return cls(
-            next_state=checks.to_device(next_state, jnp.int32),
-            probability=checks.to_device(probability, dtype),
-            wide_pairs=checks.to_device(wide_pairs),
-            wide_successors=checks.to_device(lists[0], jnp.int32) if is_shared else None,
-            predecessors=jax.tree.map(checks.to_device, predecessors),
-            edges=jax.tree.map(checks.to_device, edge_chains.find_edges(next_state, probability)),
-            narrow_width=width,
+        index = _index_lists(next_state, probability > 0, None)
+        return cls(probability=checks.to_device(probability, dtype), **index)
+
+    @property
+    def sizes(self) -> ListSizes:
+        """The sizes of the arrays."""
+        return ListSizes(
+            slots=self.probability.shape[-1],
+            narrow_width=self.narrow_width,
+            wide_pairs=len(self.wide_pairs),
+            shares_successors=self.wide_successors is not None,
+            predecessors=self.predecessors.size,
+            edges=len(self.edges.source),
+            outgoing=self.edges.outgoing.size,
+            incoming=self.edges.incoming.size,
         )
+
+    def in_sizes(self, sizes: ListSizes) -> SuccessorLists:
+        """The same transitions in arrays of other sizes, large enough; on the host, but for the probabilities."""
+        if sizes == self.sizes:
+            return self
+        padding = ((0, 0), (0, 0), (0, sizes.slots - self.probability.shape[-1]))
+        next_state, used = np.pad(np.asarray(self.next_state), padding), np.pad(self.known_slots(), padding)
+        traced = checks.is_traced(self.probability)
+        probability = jnp.pad(self.probability, padding) if traced else np.pad(np.asarray(self.probability), padding)
+        return type(self)(probability=checks.to_device(probability), **_index_lists(next_state, used, sizes))
 
     @property
     def transition(self) -> Float[Array, "S A S"]:
@@ -169,13 +180,14 @@ class SuccessorLists(Dynamics):
 
     def _narrow_rows(self, value) -> tuple[Int[Array, "S A W"], Float[Array, "S A W"], Float[Array, "S+J *B"]]:
         """Indices and weights, and the values that they read: E[value(s') | s, a] is their `gather_sum`."""
-        width, (num_states, _, slots) = self.narrow_width, self.next_state.shape
+        width, (num_states, num_actions, slots) = self.narrow_width, self.next_state.shape
         index, weight = self.next_state[..., :width], self.probability[..., :width]
         if self.wide_pairs.size:
             # A wide row's expectation is computed beside the states' values and looked up like one more state.
-            wide = self.probability.reshape(-1, slots)[self.wide_pairs]
+            real = jnp.minimum(self.wide_pairs, num_states * num_actions - 1)  # nobody reads what padding leads to
+            wide = self.probability.reshape(-1, slots)[real]
             if self.wide_successors is None:
-                expectation = gather_sum(self.next_state.reshape(-1, slots)[self.wide_pairs], wide, value)
+                expectation = gather_sum(self.next_state.reshape(-1, slots)[real], wide, value)
             else:
                 expectation = wide @ value[self.wide_successors]
             lookup = num_states + jnp.arange(self.wide_pairs.size, dtype=index.dtype)
@@ -187,5 +199,35 @@ class SuccessorLists(Dynamics):
 
 
 def _replace_pairs(rows: Array, pairs: Int[Array, " J"], replacement: Array) -> Array:
-    """`rows` [S, A, W] with those of the given flat pairs exchanged."""
-    return rows.reshape(-1, rows.shape[-1]).at[pairs].set(replacement).reshape(rows.shape)
+    """`rows` [S, A, W] with those of the given flat pairs exchanged; there is no pair S A, the padding's."""
+    return rows.reshape(-1, rows.shape[-1]).at[pairs].set(replacement, mode="drop").reshape(rows.shape)
+
+
+def _index_lists(
+    next_state: Int[np.ndarray, "S A N"], used: Bool[np.ndarray, "S A N"], sizes: ListSizes | None
+) -> dict[str, Any]:
+    """All fields of `SuccessorLists` but the probabilities, in the given sizes or, if None, in those of the model."""
+    num_states, _, slots = next_state.shape
+    counts, (entry,) = used.sum(axis=-1).ravel(), np.nonzero(used.ravel())
+    width = min(rounded_width(narrow_width(counts)), slots) if sizes is None else sizes.narrow_width
+    pairs = np.flatnonzero(counts > width)
+    lists = next_state.reshape(-1, slots)[pairs]
+    is_shared = len(lists) > 0 and bool((lists == lists[0]).all())
+    if sizes is None:
+        num_wide = rounded_count(len(pairs), counts.size * width // slots)
+    else:
+        num_wide, is_shared = sizes.wide_pairs, sizes.shares_successors
+    wide_pairs = np.full(num_wide, counts.size, np.int32)
+    wide_pairs[: len(pairs)] = pairs
+    shared = (lists[0] if len(lists) else np.zeros(slots)).astype(np.int32) if is_shared else None
+    rows = None if sizes is None else sizes.predecessors
+    predecessors = pad_rows(entry, next_state.ravel()[entry], num_states, next_state.size, rows)
+    edges = edge_chains.find_edges(next_state, used, sizes)
+    return {
+        "next_state": checks.to_device(next_state, jnp.int32),
+        "wide_pairs": checks.to_device(wide_pairs),
+        "wide_successors": None if shared is None else checks.to_device(shared),
+        "predecessors": jax.tree.map(checks.to_device, predecessors),
+        "edges": jax.tree.map(checks.to_device, edges),
+        "narrow_width": width,
+    }

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
+from jaxhom import checks
 from jaxhom.solvers.block_tridiagonal import Blocks, order_in_blocks
 from jaxhom.solvers.inverse_factor import inverse_factor_in_loops
 from jaxhom.status import Record
@@ -59,8 +60,8 @@ class Gathered(Record):
             at = np.where(there, matrix.indptr[some, None] + slot, 0)
             weight = np.where(there, matrix.data[at], 0.0) if matrix.nnz else np.zeros(at.shape)
             index = np.where(there, matrix.indices[at], 0) if matrix.nnz else at
-            parts.append((jnp.asarray(index, jnp.int32), jnp.asarray(weight, float)))
-        return cls(parts=tuple(parts), place=jnp.asarray(np.argsort(order), jnp.int32))
+            parts.append((checks.to_device(index, jnp.int32), checks.to_device(weight, float)))
+        return cls(parts=tuple(parts), place=checks.to_device(np.argsort(order), jnp.int32))
 
     def __matmul__(self, vectors: Float[Array, "L m"]) -> Float[Array, "L n"]:
         sums = [(vectors[:, index] * weight).sum(axis=-1) for index, weight in self.parts]
@@ -239,15 +240,15 @@ def band_system(
     system = BandSystem(
         core=Gathered.of(ordered),
         core_transpose=Gathered.of(ordered.T),
-        features=jnp.asarray(features, float),
-        group=jnp.asarray(group, jnp.int32),
+        features=checks.to_device(features, float),
+        group=checks.to_device(group, jnp.int32),
         members=Gathered.of(members),
         band=band,
         diagonal=diagonal,
         left=left,
         crossing=crossing,
         border=border,
-        free_column=jnp.asarray(free_column, float),
+        free_column=checks.to_device(free_column, float),
     )
     return system, blocks
 
@@ -277,7 +278,7 @@ def _band(core, blocks: Blocks):
     left[i[~same] // size, i[~same] % size, j[~same] % size] = number[~same]
     filling = np.arange(n - (count - 1) * size, size)
     diagonal[-1, filling, filling] = len(number) + 1
-    return sums, jnp.asarray(diagonal), jnp.asarray(left)
+    return sums, checks.to_device(diagonal), checks.to_device(left)
 
 
 def _crossing(core, phi, blocks: Blocks):
@@ -286,7 +287,7 @@ def _crossing(core, phi, blocks: Blocks):
     (i, k), sums = _entries(row, feature, pair, weight, core.shape)
     border = np.zeros((blocks.count, blocks.size, phi.shape[1]), np.int32)
     border[i // blocks.size, i % blocks.size, k] = 1 + np.asarray(sums.place)
-    return sums, jnp.asarray(border)
+    return sums, checks.to_device(border)
 
 
 def _joined(one, two):

@@ -39,6 +39,11 @@ class Blocks:
         """Number of blocks."""
         return -(-len(self.order) // self.size)
 
+    def rounded(self) -> Blocks:
+        """With blocks of one of four sizes per power of two: the matrices of maps of one size then share programs."""
+        step = max(1, (1 << (self.size.bit_length() - 1)) // 4)
+        return dataclasses.replace(self, size=min(-(-self.size // step) * step, len(self.order)))
+
     @property
     def work(self) -> float:
         """Multiplications of a factorisation, to compare orders by."""

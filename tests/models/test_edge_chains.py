@@ -58,9 +58,11 @@ def test_edges(name):
     case = small_models.case(name)
     edges, entries = case.mdp.dynamics.edges, np.append(np.ravel(case.mdp.probability), 0.0)
     source, target = np.nonzero((case.transition > 0).any(axis=1))
-    np.testing.assert_array_equal(edges.source, source)
-    np.testing.assert_array_equal(edges.target, target)
-    np.testing.assert_allclose(entries[edges.entry], case.transition[source, :, target], rtol=0, atol=0)
+    count = len(source)  # what is behind fills the arrays up
+    np.testing.assert_array_equal(edges.source[:count], source)
+    np.testing.assert_array_equal(edges.target[:count], target)
+    np.testing.assert_array_equal(entries[edges.entry[:count]], case.transition[source, :, target])
+    assert (np.asarray(edges.entry)[count:] == case.mdp.probability.size).all()
     for rows, ends in ((edges.outgoing, source), (edges.incoming, target)):
         for s in range(len(case.transition)):
             listed = np.concatenate([rows.narrow[s], *np.asarray(rows.wide)[np.asarray(rows.wide_row) == s]])
@@ -141,6 +143,6 @@ def test_gathers_are_saved_where_actions_share_successors(shared, width, saves):
     """Twenty states of a ring, four actions with four successors each: the same ones, or others."""
     s, a, n = np.indices((20, 4, 4))
     next_state = (s + n + (0 if shared else 4 * a)) % 20
-    edges = find_edges(next_state, np.full(next_state.shape, 0.25))
+    edges = find_edges(next_state, np.full(next_state.shape, True))
     assert len(edges.source) == (80 if shared else 320)
     assert saves_gathers(edges, width) == saves

@@ -67,6 +67,7 @@ STEPS = {
     "neighbours": lambda m: jaxhom.nearest_neighbors(m.mdp, m.walks),
     "neighbours in space": lambda m: jaxhom.nearest_neighbors(m.mdp, m.walks, metric="euclidean", coordinates=m.cells),
     "uniform": lambda m: jaxhom.uniform_elsewhere(m.mdp, m.walks),
+    "global map": lambda m: jaxhom.soft_homomorphism(m.mdp, m.walks, tolerance=3e-2),
     "lpal": lambda m: jaxhom.lpal(m.mdp, m.vhat),
     "lpal, columns": lambda m: jaxhom.lpal(m.mdp, m.vhat, method="columns"),
     "lpal, interior point": lambda m: jaxhom.lpal(m.mdp, m.vhat, method="interior_point"),

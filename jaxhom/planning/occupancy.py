@@ -96,9 +96,8 @@ def feature_expectations(mdp: MDP, policy: Policy) -> Float[Array, "*B K"]:
     mdp = as_model(mdp)
     policy = check_policy(mdp, policy)
     if checks.is_at_hand(mdp, policy):
-        pairs, features = _occupancy_at_hand(mdp, policy), np.asarray(mdp.features)
-        expected = pairs.reshape(*policy.shape[:-2], -1) @ features.reshape(-1, mdp.num_features)
-        return checks.to_device(expected)
+        pairs = _occupancy_at_hand(mdp, policy).reshape(*policy.shape[:-2], mdp.allowed.size)
+        return checks.to_device(pairs @ np.asarray(mdp.features).reshape(mdp.allowed.size, mdp.num_features))
     return jnp.einsum("...sa,sak->...k", occupancy(mdp, policy), mdp.features)
 
 

@@ -468,3 +468,10 @@ def test_an_occupancy_has_the_policy_that_it_came_from(rng):
     x = occupancy(case.mdp, policy)
     expected = np.where(has_occupancy(case.mdp, x)[:, None], policy, 0.5)
     np.testing.assert_allclose(jax.jit(policy_from_occupancy)(case.mdp, x, 0.5), expected, rtol=0, atol=1e-9)
+
+
+def test_no_features_have_no_expectations():
+    mdp = small_models.case("restart").mdp.replace(features=np.zeros((100, 3, 0)))
+    policies = np.full((2, 100, 3), 1 / 3)
+    assert feature_expectations(mdp, policies[0]).shape == (0,)
+    assert feature_expectations(mdp, policies).shape == (2, 0)

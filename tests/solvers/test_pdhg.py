@@ -51,9 +51,11 @@ def points(dtype, length):
     return {name: point.astype(dtype) for name, point in cases.items()}
 
 
-@jax.jit
 def project_both(point):
     return project_simplex(point), project_l1_ball(point, axes=(0,))
+
+
+project_both_inside = jax.jit(project_both)
 
 
 @jax.jit
@@ -62,7 +64,7 @@ def expected_projections(for_simplex, for_ball):
     return projection_simplex(for_simplex), projection_l1_ball(for_ball)
 
 
-def assert_projects(dtype, cases):
+def assert_projects(dtype, cases, project=project_both_inside):
     """Onto the simplex and the ball, all cases in one call; jaxopt in float64 is the oracle.
 
     A threshold next to the largest entry is good to that entry's rounding. jaxopt's own is not always: it sums
@@ -70,7 +72,7 @@ def assert_projects(dtype, cases):
     """
     stacked = np.concatenate(list(cases.values()), axis=1)
     exact = stacked.astype(float)
-    onto_simplex, onto_ball = map(np.asarray, project_both(stacked))
+    onto_simplex, onto_ball = map(np.asarray, project(stacked))
     assert onto_simplex.dtype == onto_ball.dtype == dtype
     expected_simplex, expected_ball = expected_projections(exact - exact.max(axis=0), exact)
     largest = np.maximum(1.0, np.abs(exact.max(axis=0)))
@@ -90,10 +92,11 @@ def assert_lanes(good, cases, what):
     assert not wrong, f"{what}: {wrong}"
 
 
+@pytest.mark.parametrize("project", [project_both_inside, project_both], ids=["in a program", "in NumPy"])
 @pytest.mark.parametrize("length", [1, 40])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_projections_against_jaxopt(dtype, length):
-    assert_projects(dtype, points(dtype, length))
+def test_projections_against_jaxopt(dtype, length, project):
+    assert_projects(dtype, points(dtype, length), project)
 
 
 @pytest.mark.parametrize(
@@ -117,8 +120,9 @@ def test_projections_of_huge_ties(dtype, rng):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_points_of_the_ball_stay_where_they_are(dtype):
-    point = points(dtype, 7)["inside the ball"]
-    np.testing.assert_array_equal(jax.jit(functools.partial(project_l1_ball, axes=(0,)))(point), point)
+    point, project = points(dtype, 7)["inside the ball"], functools.partial(project_l1_ball, axes=(0,))
+    np.testing.assert_array_equal(jax.jit(project)(point), point)
+    np.testing.assert_array_equal(project(point), point)
 
 
 def test_simplex_of_another_total_along_another_axis():
@@ -143,7 +147,7 @@ def test_a_lane_that_is_not_a_number_stays_so_and_spoils_no_other():
     point = np.random.default_rng(2).normal(size=(7, 39))
     spoilt = point.copy()
     spoilt[0, 0] = np.nan
-    for result, expected in zip(project_both(spoilt), project_both(point), strict=True):
+    for result, expected in zip(project_both_inside(spoilt), project_both_inside(point), strict=True):
         assert np.isnan(result[:, 0]).any()
         np.testing.assert_allclose(result[:, 1:], expected[:, 1:], rtol=0, atol=1e-14)
 

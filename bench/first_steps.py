@@ -8,7 +8,6 @@ that compile nothing. `bench.first_speed` starts these processes.
 
 import functools
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -51,11 +50,10 @@ def _library():
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    if folder := os.environ.get("FIRST_STEPS_CACHE"):
-        jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     import jaxhom
+    from jaxhom import programs
 
+    programs.keep_programs()
     return jaxhom
 
 

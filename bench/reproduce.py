@@ -17,6 +17,7 @@ from bench import methods, settings, summaries, sweep
 from bench.provenance import RESULTS
 from bench.rows import RowFile
 from bench.sweep import Sweep
+from jaxhom import programs
 
 SWEEPS = {
     "table1": {"table1": Sweep(settings.table1(), methods.TABLE1, draws=100, sampled=True)},
@@ -35,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code: 0 done, 1 some rows failed, 2 wrong input, 130 stopped."""
     options = parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
+    programs.keep_programs()
     try:
         chosen = [(name, work, RowFile(options.output / "raw" / f"{name}.csv")) for name, work in _chosen(options)]
     except ValueError as error:

@@ -1,8 +1,9 @@
 """float64 for every test, the small models that the tests share (see `small_models`), bounds on time and memory.
 
-Most of the time goes to compiling. Compiled programs are kept in a folder, where the other processes of a run and the
-next run find them, and are made with fewer passes: a quarter of the time, and the same numbers up to rounding, which
-another machine would not give to the last digit either. `JAXHOM_TESTS_AS_USERS=1` compiles as users do.
+Most of the time goes to compiling. Compiled programs are kept in the user's folder for caches, where the other
+processes of a run and the next run find them, and are made with fewer passes: a quarter of the time, and the same
+numbers up to rounding, which another machine would not give to the last digit either. `JAXHOM_TESTS_AS_USERS=1`
+compiles as users do, `JAXHOM_CACHE=off` keeps nothing.
 """
 
 import contextlib
@@ -17,17 +18,19 @@ import numpy as np
 import pytest
 import small_models
 
+from jaxhom.programs import folder_for_programs
+
 _MUCH = 1.3e9  # bytes of a process from which on it gives memory back
 
 jax.config.update("jax_enable_x64", True)
 
 if not os.environ.get("JAXHOM_TESTS_AS_USERS"):
-    os.environ.setdefault(
-        "JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parents[1] / ".pytest_cache/programs")
-    )
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # in the processes that tests start
-    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    folder = folder_for_programs()
+    if folder is not None:
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder / "tests"))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # in the processes that tests start
+        jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jaxlib.__version__.startswith("0.10."):  # an XLA that does not know a flag aborts
         os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy
 
 from jaxhom.apprenticeship.flow_splitting import FlowFactor, Splitting
 from jaxhom.models.mdp import MDP, push_forward

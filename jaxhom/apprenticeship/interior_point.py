@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
-import scipy.sparse
+import scipy
 from tqdm import tqdm
 
 from jaxhom import checks

@@ -38,7 +38,18 @@ def add_command(
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(run=run)
+    add_cache_option(parser)
     return parser
+
+
+def add_cache_option(parser: Parser) -> None:
+    """Before a command or after it."""
+    parser.add_argument(
+        "--no-cache",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="neither read nor keep compiled programs (JAXHOM_CACHE=off does the same; a folder there moves them)",
+    )
 
 
 def add_model_options(parser: Parser) -> None:

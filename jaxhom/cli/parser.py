@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import jax
 
-from jaxhom import interrupts
+from jaxhom import interrupts, programs
 from jaxhom.cli import evaluate, explain, learn, main_job, plot
-from jaxhom.cli.options import Parser
+from jaxhom.cli.options import Parser, add_cache_option
 
 _DESCRIPTION = """\
 Apprenticeship learning from a few demonstrations via soft local homomorphisms.
@@ -23,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
     options = make_parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
+    if not getattr(options, "no_cache", False):
+        programs.keep_programs()
     try:
         with warnings.catch_warnings():  # what a command decides about warnings ends with it
             options.run(options)
@@ -43,6 +45,7 @@ def make_parser() -> Parser:
         prog="python -m jaxhom", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     main_job.add_options(parser)
+    add_cache_option(parser)
     commands = parser.add_subparsers(dest="command", title="commands", metavar="{learn,evaluate,explain,plot}")
     for command in (learn, evaluate, explain, plot):
         command.add_parser(commands)

@@ -18,7 +18,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy
 
 from jaxhom.models.mdp import MDP, expected_next_value, push_forward
 from jaxhom.solvers.arrays import module_of

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
-import scipy.sparse
+import scipy
 
 from jaxhom import checks
 from jaxhom.generalization import evidence

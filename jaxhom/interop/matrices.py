@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP

@@ -33,8 +33,7 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
-import scipy.special
+import scipy
 
 from jaxhom import checks
 from jaxhom.interop.matrices import from_scipy

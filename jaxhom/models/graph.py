@@ -10,8 +10,7 @@ import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
+import scipy
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP

@@ -16,10 +16,7 @@ import weakref
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
-import scipy.sparse.csgraph
-import scipy.sparse.linalg
+import scipy
 
 from jaxhom.models.mdp import MDP
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from jaxhom.planning.host_chains import HostModel
 

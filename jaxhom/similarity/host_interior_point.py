@@ -12,7 +12,7 @@ import threading
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.linalg.lapack
+import scipy
 
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import Certificate, adjoint, forward

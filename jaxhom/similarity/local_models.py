@@ -12,7 +12,7 @@ to keep (`homomorphism_lp`); the rows of such actions are zero.
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from jaxhom import checks
 from jaxhom.models.graph import HostGraph, host_graph

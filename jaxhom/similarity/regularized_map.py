@@ -11,7 +11,7 @@ proximal steps; its derivative is implicit, one linear system of the fixed point
 `custom_fixed_point`), whatever the number of iterations. On the boundary between two faces of the constraints, where f
 is not differentiable, one of the one-sided derivatives comes back.
 
-jaxopt is no longer maintained; this is the one module that uses it.
+jaxopt is no longer maintained; this is the one module that uses it, and loads it when a map is asked for.
 """
 
 from __future__ import annotations
@@ -26,10 +26,6 @@ import jax.numpy as jnp
 from jaxhom import checks
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.solvers import pdhg
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)
-    from jaxopt import implicit_diff, linear_solve
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Float
@@ -76,6 +72,9 @@ def homomorphism_map(
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def _map(source, target, regularization, anchored):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        from jaxopt import implicit_diff, linear_solve
     n, num_actions, _ = source.shape
     m = target.shape[0]
     size = n * m

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from typing import TYPE_CHECKING
 
-import scipy.linalg  # noqa: F401  its BLAS has to be loaded before it is looked for
-import threadpoolctl
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 
 def one_blas_thread() -> contextlib.AbstractContextManager:
@@ -19,5 +20,8 @@ def one_blas_thread() -> contextlib.AbstractContextManager:
 
 
 @functools.cache
-def _controller() -> threadpoolctl.ThreadpoolController:
+def _controller() -> ThreadpoolController:
+    import scipy.linalg  # noqa: F401  its BLAS has to be loaded before it is looked for
+    import threadpoolctl
+
     return threadpoolctl.ThreadpoolController()

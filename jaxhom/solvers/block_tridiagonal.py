@@ -11,9 +11,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg.lapack
-import scipy.sparse
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+import scipy
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -58,7 +56,7 @@ def order_in_blocks(pattern: scipy.sparse.sparray | np.ndarray, min_size: int = 
       min_size: of a block: smaller ones are more calls, not less work.
     """
     pattern = scipy.sparse.csr_array(pattern)
-    order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     place, entries = np.argsort(order), pattern.tocoo()
     width = int(np.abs(place[entries.row] - place[entries.col]).max())
     size = max(width, min_size)

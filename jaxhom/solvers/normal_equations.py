@@ -14,8 +14,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
+import scipy
 
 from jaxhom.solvers.block_tridiagonal import BlockCholesky, order_in_blocks
 

@@ -22,7 +22,6 @@ from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
-from jaxhom.similarity.table import SimilarityTable
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
@@ -35,7 +34,7 @@ Found = tuple[Generalization, dict[str, Any]]
 def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, **settings) -> Found:
     if problem.terminal is not None:  # no action matters there, and their local models can be large
         states = ~problem.terminal if states is None else states & ~problem.terminal
-    table = SimilarityTable(problem.mdp, distance=settings.get("distance", 1), anchored=not printed)
+    table = problem.similarity(settings.get("distance", 1), anchored=not printed)
     options = {**settings, "anchored": not printed, "mutual": mutual, "table": table, "progress": progress}
     found = soft_local_homomorphism(problem.mdp, demonstrations, states=states, **options)
     return found, {"classes_of_local_models": table.num_classes, "pairs_of_classes_solved": table.num_solved}

@@ -34,6 +34,7 @@ from jaxhom.models.impossible_steps import ImpossibleStepsWarning
 from jaxhom.models.inputs import check_coordinates, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
 from jaxhom.planning.optimal import Plan, optimal_policy
+from jaxhom.similarity.table import SimilarityTable
 
 _DISCOUNT = 0.99  # as the domains of the library
 _TRACK_STEPS = 20  # of a demonstration on a racetrack, and of a trial below, as in the paper
@@ -77,6 +78,17 @@ class Problem:
         if self.reward is None:
             raise ValueError(f"{self.name} has no reward (array 'reward')")
         return optimal_policy(self.mdp, self.reward)
+
+    def similarity(self, distance: int = 1, *, anchored: bool = True) -> SimilarityTable:
+        """The table of the model's local models, one for all sets of demonstrations: no pair is solved again."""
+        key = distance, anchored
+        if key not in self._tables:
+            self._tables[key] = SimilarityTable(self.mdp, distance=distance, anchored=anchored)
+        return self._tables[key]
+
+    @functools.cached_property
+    def _tables(self) -> dict[tuple[int, bool], SimilarityTable]:
+        return {}
 
     @property
     def events(self) -> dict[str, Any]:

@@ -81,6 +81,11 @@ def play(
     return jax.tree.map(np.asarray, solve(stacked, is_column, bound, start, goal, share))
 
 
+def prepare(num_features: int, width: int, dtype: np.dtype) -> None:
+    """Compiles the first program of `play`: a game without anything to win."""
+    play([np.zeros((num_features, 1), dtype)], [(0.0, np.zeros(1))], [0.0], 1.0, 0.0, width)
+
+
 def _play_on_host(payoff, former, bound, tolerance, share) -> GameSolution:
     everything = np.ones(payoff.shape[1], bool)
     return solve_game(payoff, everything, tolerance=tolerance, share=share, bound=bound, start=former)

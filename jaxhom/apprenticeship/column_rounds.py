@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.apprenticeship.column_games import capacities, play
+from jaxhom.apprenticeship.column_games import capacities, play, prepare
 from jaxhom.apprenticeship.column_lane import SLACK, Lane
 from jaxhom.apprenticeship.exact import NEAR_ONE, Exact
 from jaxhom.apprenticeship.policy_pool import PolicyPool
@@ -35,6 +35,7 @@ _LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to the boun
 _NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact, and many rare states add up
 _FROM_POOL = 8  # policies of other lanes that join a game at a time: 16 lanes of bumps24 (bench/results/speed_lpal.csv)
 # take 342 iterations, 381 if none may join
+_prepared: set[str] = set()  # kinds of models whose programs are there, or under way
 _WORTHWHILE = 0.1  # share of the open gap by which they have to be better
 
 
@@ -56,6 +57,21 @@ class Rounds:
         self._pulls = _FEW_PULLS if mdp.num_features <= _FEW_FEATURES else _PULLS
         self._error = 0.25 * SLACK * float(request.tolerance.min())
         self._exact = request.model.once(_exact_where_rough) or _exact_if_small(request)
+
+    def programs(self) -> list[Callable[[], object]]:
+        """Calls that compile what the first round is going to run, where that is done in programs; once."""
+        shapes = [leaf.shape for leaf in jax.tree.leaves(self._mdp)]
+        kind = str((self._mdp.dtype, shapes, jax.tree.structure(self._mdp), self._width))
+        if self._exact is not None or kind in _prepared:
+            return []
+        _prepared.add(kind)
+        num_features, dtype = self._mdp.num_features, np.dtype(self._mdp.dtype)
+        some = np.full((self._width, num_features), 1.0 / num_features, dtype)
+        value, enough = np.zeros((self._width, self._mdp.num_states), dtype), np.full(self._width, np.inf, dtype)
+        return [
+            lambda: respond(self._mdp, some, some, value, enough, self._error),
+            lambda: prepare(num_features, self._width, self._pool.expected.dtype),
+        ]
 
     def lanes(self) -> list[Lane]:
         """One for each problem; with a first column where there is a policy to begin with."""

@@ -68,6 +68,8 @@ class Columns:
         workers, width = _workers_and_width(request.model.mdp, total)
         self._threads, self._most = ThreadPoolExecutor(workers), _LANES_AT_A_TIME * workers * width
         self._rounds = Rounds(request, self._limit, width, workers, self._threads.map)
+        for compile_ahead in self._rounds.programs():  # while the first policies are evaluated
+            self._threads.submit(compile_ahead)
         self._lanes = self._rounds.lanes()
 
     def __enter__(self) -> Columns:

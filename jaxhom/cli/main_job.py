@@ -198,7 +198,7 @@ def _gridworld_setting(key: jax.Array, size: int, regions: int, sets: int) -> _S
     """The gridworld, with a reward of its own for every set."""
     world = gridworld(size, num_regions=regions)
     draw_key, sample_key = jax.random.split(key)
-    weights = jax.vmap(lambda k: sample_weights(k, regions))(jax.random.split(draw_key, sets))
+    weights = jnp.stack([sample_weights(k, regions) for k in jax.random.split(draw_key, sets)])
     reward = jnp.einsum("sak,bk->bsa", world.mdp.features, weights.astype(world.mdp.dtype))
     expert = optimal_policy(world.mdp, reward)
     keys = jax.random.split(sample_key, sets)

@@ -146,7 +146,7 @@ def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
     return (_weights_at_hand if checks.is_at_hand(key) else _weights)(key, num_regions)
 
 
-def _weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
+def _draws(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
     """Draws until one is positive."""
 
     def draw(key):
@@ -165,7 +165,7 @@ def _weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
     return weights
 
 
-_weights_at_hand = quick_jit(_weights, static_argnums=1)
+_weights, _weights_at_hand = jax.jit(_draws, static_argnums=1), quick_jit(_draws, static_argnums=1)
 
 
 def _transition(coordinates, size: int, noise: float) -> tuple[np.ndarray, np.ndarray]:

@@ -135,7 +135,7 @@ def test_lpal_is_certified(files, options):
     tolerance = float(options.split("lpal-tolerance")[1]) if "tolerance" in options else 1e-3
     assert found["margin_bound"] - found["margin"] <= tolerance
     margin = oracles.margin(transition, 0.99, initial, features, expectations, files.policy())
-    np.testing.assert_allclose(found["margin"], margin, atol=1e-9)
+    assert margin - 1e-4 * tolerance <= found["margin"] <= margin + 1e-9  # rounded down by no more than that
 
 
 @pytest.mark.parametrize(

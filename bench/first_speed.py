@@ -1,7 +1,10 @@
-"""Measures what a fresh process waits for: pairs of local models, and the whole path as one program of a key.
+"""Measures what a fresh process waits for: steps, pairs of local models, and the whole path as one program of a key.
 
-A section of pairs solves so many random pairs of five states, four actions, as brackets or decisions: the first call,
-and the median of three more, beside HiGHS, which solves one after the other on one core.
+The section of steps is `bench.fresh_processes`.
+
+A section of pairs solves so many random pairs of five states, four actions, or sixty pairs of two to 25 states, nine
+actions, as brackets or decisions: the first call, and the median of three more, beside HiGHS, which solves one after
+the other on one core.
 
 A section of draws is a domain. Its rows: the program over all draws at once, the same sharded over two devices that are
 forced on the host, and the plain calls in a loop. They are judged against each other: votes and radii have to be the
@@ -24,7 +27,9 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 import jaxhom  # noqa: E402
-from bench import similarity_speed  # noqa: E402
+from bench import fresh_processes, similarity_speed  # noqa: E402
+from bench.linear_programs import Homomorphisms  # noqa: E402
+from bench.lp_peers import Highs, Settings  # noqa: E402
 from bench.processes import peak_gb  # noqa: E402
 from bench.provenance import provenance  # noqa: E402
 from jaxhom.similarity.brackets import Goal, bracket_errors  # noqa: E402
@@ -32,6 +37,7 @@ from jaxhom.similarity.brackets import Goal, bracket_errors  # noqa: E402
 SEED = 0
 _LOOP = 5  # draws of the plain calls, after the first
 _PACKAGES = ("jax", "numpy", "highspy")
+_LIMIT = 60.0  # seconds of a pair
 _HIGHS_PAIRS = 512  # at most: its time is proportional
 
 
@@ -101,7 +107,77 @@ PAIRS = {f"{work}_{count}": (work, count) for work in ("pairs", "decisions") for
 def section(name: str, quick: bool, methods: None, limit: None) -> Iterator[dict]:
     """All rows of a section."""
     del methods, limit
-    yield from _pair_rows(*PAIRS[name]) if name in PAIRS else _draw_rows(name, quick)
+    if name == "steps":
+        fields = {"devices": 1, "draws": 1, "status": "measured", "note": "", "settled": ""} | provenance(*_PACKAGES)
+        yield from (fields | row for row in fresh_processes.rows(quick))
+    elif name in MIXED:
+        yield from _mixed_rows(MIXED[name], 6 if quick else _MIXED_PAIRS)
+    else:
+        yield from _pair_rows(*PAIRS[name]) if name in PAIRS else _draw_rows(name, quick)
+
+
+MIXED = {"pairs_mixed": "pairs", "decisions_mixed": "decisions"}
+_MIXED_PAIRS, _MIXED_ACTIONS, _MIXED_STATES = 60, 9, 60
+_MIXED_PEERS = {"highs_simplex": "simplex", "highs_interior_point": "ipm"}
+
+
+def _mixed_rows(work: str, count: int) -> Iterator[dict]:
+    """Pairs of local models of two to 25 states of one model, brackets or decisions: ours, and HiGHS's."""
+    mdp = _mixed_model(np.random.default_rng(SEED))
+    source, target = np.random.default_rng(SEED + 1).permutation(_MIXED_STATES * 2).reshape(2, -1)[:, :count]
+    source, target = source % _MIXED_STATES, target % _MIXED_STATES
+    is_decision = work == "decisions"
+
+    def ours():
+        table = jaxhom.SimilarityTable(mdp)
+        if is_decision:
+            return table.decisions(source, target, similarity_speed.THRESHOLD)
+        return table.brackets(source, target, tolerance=similarity_speed.GAP)
+
+    found, first, seconds, _ = similarity_speed.clocked(ours)
+    settled = float(np.mean(found.status == jaxhom.Status.SOLVED))
+    fields = {"instance": f"{work} of 2 to 25 states", "devices": 1, "draws": count, "status": "measured", "note": ""}
+    fields |= provenance(*_PACKAGES)
+    times = {"first_s": first, "seconds": seconds / count, "peak_gb": peak_gb(), "settled": settled}
+    yield fields | {"method": "jaxhom"} | times
+    bounds = jaxhom.SimilarityTable(mdp).brackets(source, target, tolerance=similarity_speed.GAP)
+    models = [tuple(_local_model(mdp, state) for state in pair) for pair in zip(source, target, strict=True)]
+    for method, solver in _MIXED_PEERS.items():
+        begun = time.perf_counter()
+        errors = np.array([_highs_error(solver, *pair) for pair in models])
+        seconds = time.perf_counter() - begun
+        agrees = (errors >= bounds.lower - 1e-5) & (errors <= bounds.upper + 1e-5)
+        yield fields | {"method": method, "first_s": seconds, "seconds": seconds / count, "settled": agrees.mean()}
+
+
+def _mixed_model(rng: np.random.Generator) -> jaxhom.MDP:
+    """States on a ring, each with a reach of its own: an action leads to at most four states within it."""
+    transition = np.zeros((_MIXED_STATES, _MIXED_ACTIONS, _MIXED_STATES))
+    reach = rng.integers(0, 25, _MIXED_STATES)
+    for state in range(_MIXED_STATES):
+        for action in range(_MIXED_ACTIONS):
+            number = rng.integers(1, 5)
+            successors = (state + rng.integers(0, 2 * reach[state] + 1, number)) % _MIXED_STATES
+            np.add.at(transition[state, action], successors, rng.dirichlet(np.ones(number)))
+    return jaxhom.MDP.from_dense(transition, discount=0.9)
+
+
+def _local_model(mdp: jaxhom.MDP, state: int) -> np.ndarray:
+    """The model within a step of a state, centre first; what leaves it stays where it is. In NumPy."""
+    transition = np.asarray(mdp.transition)
+    near = np.flatnonzero((transition[state] > 0).any(axis=0))
+    states = np.append(state, near[near != state])
+    within = transition[np.ix_(states, range(mdp.num_actions), states)]
+    own = np.arange(len(states))
+    within[own, :, own] += 1.0 - within.sum(axis=2)
+    return within
+
+
+def _highs_error(solver: str, source: np.ndarray, target: np.ndarray) -> float:
+    settings = Settings(1e-7, {"presolve": "off"}) if solver == "simplex" else Settings(0.1 * similarity_speed.GAP)
+    peer, pair = Highs(solver, settings, threads=1), (source, target)
+    peer.load([Homomorphisms(*pair, anchored=True).given(pair)])
+    return float(peer.solve(_LIMIT)[0][0][-1])
 
 
 def _pair_rows(work: str, count: int) -> Iterator[dict]:

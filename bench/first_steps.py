@@ -19,7 +19,7 @@ LAKE = 8
 
 def main(step: str, method: str) -> dict[str, float]:
     """Seconds of the first and of the second call."""
-    if step == "import":
+    if step not in STEPS:
         return {"first_s": _import_seconds()}
     call = STEPS[step][method]()
     return {"first_s": _seconds(call), "seconds": _seconds(call)}

@@ -16,7 +16,7 @@ import pathlib
 import sys
 from collections.abc import Callable, Iterator
 
-from bench import speed_report
+from bench import first_report, speed_report
 from bench.processes import NoAnswer, Worker
 from bench.provenance import RESULTS
 
@@ -89,19 +89,32 @@ KINDS = {
         has_methods=True,
     ),
     "first": Kind(
-        title="what a fresh process waits for: pairs, and the whole path as one program",
+        title="what a fresh process waits for: steps, pairs, and the whole path as one program",
         sections=(
+            "steps",
             *("pairs_2", "pairs_100", "pairs_1000", "pairs_10000"),
             *("decisions_2", "decisions_100", "decisions_1000", "decisions_10000"),
+            *("pairs_mixed", "decisions_mixed"),
             *("draws_grid16", "draws_grid16_two_devices", "draws_racetrack_a"),
         ),
-        quick=("pairs_2", "draws_grid16"),
+        quick=("pairs_2", "pairs_mixed", "draws_grid16"),
         fields=(
-            *("section", "instance", "method", "draws", "devices", "prepare_s", "first_s", "seconds", "peak_gb"),
+            *(
+                "section",
+                "instance",
+                "method",
+                "cache",
+                "draws",
+                "devices",
+                "prepare_s",
+                "first_s",
+                "seconds",
+                "peak_gb",
+            ),
             *("settled", "status", "note", "versions", "commit"),
         ),
-        table=speed_report.first_table,
-        figure=lambda rows: None,
+        table=first_report.table,
+        figure=first_report.figure,
     ),
 }
 

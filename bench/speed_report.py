@@ -13,9 +13,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 _MARKERS = "osD^vP*X"
-_MADE = "Made from the rows of the CSV file of the same name."
+MADE = "Made from the rows of the CSV file of the same name."
 
 Curves = dict[tuple[str, bool], list[tuple[int, float]]]  # (method, whether in a batch): of (size, seconds)
 
@@ -84,8 +84,8 @@ def figure(panels: dict[tuple[str, str], Curves], size: tuple[float, float], wha
     for axes, ((title, xlabel), found) in zip(all_axes[0], panels.items(), strict=True):
         for (method, batch), points in found.items():
             k = methods.index(method)
-            options = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "markersize": 5}
-            options |= {"linestyle": "--" if batch else "-", "alpha": 1.0 if k < len(_COLOURS) else 0.5}
+            options = {"color": COLOURS[k % len(COLOURS)], "marker": _MARKERS[k % len(_MARKERS)], "markersize": 5}
+            options |= {"linestyle": "--" if batch else "-", "alpha": 1.0 if k < len(COLOURS) else 0.5}
             axes.loglog(*zip(*points, strict=True), label=None if batch else method, **options)
         if any(batch for _, batch in found):
             axes.plot([], [], linestyle="--", color="grey", label="in a batch")
@@ -124,7 +124,7 @@ def similarity_table(rows: list[dict]) -> str:
         parts.append((work, _SIMILARITY_HEADER, cells))
     if peak := [row for row in rows if row["work"] in _PEAK]:
         parts.append(("Distance from the machine's peak", _PEAK_HEADER, [_peak_cells(row) for row in peak]))
-    return document("Speed of the similarity engine", _MADE, parts)
+    return document("Speed of the similarity engine", MADE, parts)
 
 
 def _similarity_cells(row: dict, peer: float | None) -> list:
@@ -161,7 +161,7 @@ def similarity_figure(rows: list[dict]) -> Figure | None:
 # --------------------------------------------------------------------------------------------------------------- LPAL
 
 OVER_STATES = ("grid16", "grid24", "grid32", "grid48", "grid100", "grid316")  # one family: the figure's points
-_LPAL_WORDS = f"""{_MADE} Seconds per lane, on the
+_LPAL_WORDS = f"""{MADE} Seconds per lane, on the
 machine's two cores, compilation apart; gaps are the worst lane's, as a share of what was asked."""
 _LPAL_HEADER = [
     "| method | one, s | gap | against best peer | batch | each, s | gap | against best peer | compile s |",
@@ -263,7 +263,7 @@ WORKS = {
     "occupancy": "Occupancies of a policy",
     "policy_value": "The value of a policy",
 }
-_PLANNING_WORDS = f"""{_MADE}
+_PLANNING_WORDS = f"""{MADE}
 Seconds per lane on the machine's two cores, compilation apart; errors are the worst lane's."""
 _PLANNING_HEADER = [
     "| instance | S | lanes | method | s | error | to best peer | compile s |",
@@ -304,31 +304,3 @@ def planning_figure(rows: list[dict]) -> Figure | None:
         grids = [row for row in rows if row["work"] == work and row["section"].startswith("grid") and is_settled(row)]
         panels[title, "states"] = curves(grids, lambda row: row["method"].split()[0], "S", "seconds")
     return figure(panels, (5.2, 5.0), "seconds per lane")
-
-
-_FIRST_WORDS = f"""{_MADE}
-Every section is a process of its own, in which the first call compiles what it needs. Pairs are random local models;
-a draw goes from a key to the value of the learned policy. "settled" is the share of pairs that are, or of draws whose
-votes and radii are those of the plain calls, and whose certificates overlap theirs and are closed; of draws without
-plain calls beside them, the share of closed certificates."""
-_FIRST_HEADER = [
-    "| method | number | devices | prepared s | first call s | ms each | GB | settled |",
-    "|:--|--:|--:|--:|--:|--:|--:|--:|",
-]
-
-
-def first_table(rows: list[dict]) -> str:
-    """A table for each domain: a line per row."""
-    parts = []
-    for title in dict.fromkeys(row["instance"] for row in rows if row["status"] == "measured"):
-        members = [row for row in rows if row["instance"] == title and row["status"] == "measured"]
-        parts.append((title, _FIRST_HEADER, [_first_cells(row) for row in members]))
-    failed = [f"{row['section']}: {row['status']}, {row['note']}" for row in rows if row["status"] != "measured"]
-    return "\n".join([document("The first answer", _FIRST_WORDS, parts), *failed])
-
-
-def _first_cells(row: dict) -> list:
-    times = shown(row, prepare_s=".2g", first_s=".2g")
-    seconds = number(row, "seconds")
-    draw = "" if seconds is None else f"{1e3 * seconds:.3g}"
-    return [row["method"], row["draws"], row["devices"], *times, draw, *shown(row, peak_gb=".2g", settled=".0%")]

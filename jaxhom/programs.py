@@ -20,7 +20,13 @@ import jax
 _FEWER_PASSES = {"xla_cpu_use_fusion_emitters": False}
 # Without LLVM's optimisations as well: walks of demonstrations compile in 0.18 s instead of 0.6, and run half as fast.
 _NO_PASSES = _FEWER_PASSES | {"xla_backend_optimization_level": 0}
+_COMPILING = 2.0  # seconds, of iterations: bench/results/speed_first.csv has 2 to 4 of them cold, and 0.3 to 1 by NumPy
 _WORTH_KEEPING = 0.05  # seconds of compiling, up to which reading a file takes about as long
+
+
+def pays(seconds_on_host: float) -> bool:
+    """Whether a program is done before NumPy is: not with what takes that less than a program takes to compile."""
+    return seconds_on_host > _COMPILING
 
 
 def host_jit(function: Callable, **options: Any) -> Callable:
@@ -39,7 +45,7 @@ def keep_programs() -> None:
     For command lines; the library changes no setting of JAX by itself. A folder that JAX has been told already stands.
     """
     folder = folder_for_programs()
-    if folder is not None and not jax.config.jax_compilation_cache_dir:
+    if folder is not None and not jax.config.values["jax_compilation_cache_dir"]:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
 

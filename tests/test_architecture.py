@@ -169,6 +169,18 @@ def test_importing_changes_no_setting_and_brings_in_no_optional_library(x64):
     assert not unwanted & {name.split(".")[0] for name in loaded}
 
 
+def test_importing_waits_for_nothing_that_is_not_needed_yet():
+    """What takes JAX's own time again: solvers of SciPy, jaxopt with what it brings, and the like."""
+    probe = (
+        "import json, sys, jax; before = {*sys.modules}; import jaxhom; print(json.dumps([*{*sys.modules} - before]))"
+    )
+    environment = {"PATH": "", "JAX_PLATFORMS": "cpu"}
+    found = subprocess.run([sys.executable, "-c", probe], cwd=ROOT, env=environment, capture_output=True, check=True)
+    solvers = {f"scipy.{part}" for part in ("optimize", "linalg", "special", "spatial", "sparse")}
+    late = {"jaxopt", "optax", "numba", "threadpoolctl", "matplotlib"} | solvers
+    assert not late & set(json.loads(found.stdout))
+
+
 if __name__ == "__main__":
     for name, others in rooms().items():
         print(f"{name:16}{', '.join(sorted(others))}")

@@ -1,13 +1,13 @@
 """Small work does not compile: what the host does in milliseconds starts no program, and finds what programs find."""
 
 import contextlib
-import sys
 
 import jax
 import numpy as np
 import pytest
 
 import jaxhom
+from jaxhom import programs
 from jaxhom.models.mdp import MDP
 
 STATES, ACTIONS, FEATURES = 23, 3, 5  # shapes that no other test has: nothing is compiled for them yet
@@ -93,8 +93,8 @@ def test_compilations_are_counted():
 def test_the_global_program_on_the_host_and_in_a_program(kind, anchored, monkeypatch):
     """The same iterations, up to rounding, so the same bounds."""
     mdp, found = model(**MODELS[kind]), []
-    for small in (np.inf, 0):
-        monkeypatch.setattr(sys.modules[jaxhom.soft_homomorphism.__module__], "_SMALL_WORK", small)
+    for pays in (False, True):
+        monkeypatch.setattr(programs, "pays", lambda seconds, pays=pays: pays)
         found.append(jaxhom.soft_homomorphism(mdp, DEMONSTRATIONS, anchored=anchored, tolerance=1e-2))
     host, program = found
     digits = 1e-9 if mdp.dtype == np.float64 else 5e-3

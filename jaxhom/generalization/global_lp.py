@@ -12,6 +12,8 @@ Inside programs the demonstrated states are a list of static length that is padd
 in f and y.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom import checks
+from jaxhom import checks, programs
 from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import LEAST_SHARE, ByGlobalMap
 from jaxhom.generalization.global_lp import GlobalHomomorphismProblem, HostProblem, restricted_to_list
@@ -21,15 +21,14 @@ from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
-from jaxhom.programs import host_jit
 from jaxhom.similarity.local_models import restricted_model
 from jaxhom.solvers import pdhg
 from jaxhom.solvers.lane_queue import is_settled
 from jaxhom.status import Status
 
-# Numbers of y [S, A, E] up to which NumPy iterates: a 16 x 16 grid with 51 demonstrated states, 5e4, takes it 1.2 s,
-# where the program compiles for 3; with 2e5 an iteration takes it three times as long as the program.
-_SMALL_WORK = 1e5
+# Of a thousand iterations in NumPy, per number of y [S, A, E]: 16 x 16 cells with 24 demonstrated states take 1.2 s.
+# With 2e5 numbers an iteration takes three times as long as the program's.
+_SECONDS = 2e-5
 _ITERATIONS_PER_REPORT = 320  # a program cannot be interrupted
 
 
@@ -175,7 +174,7 @@ def _host_problem(mdp: MDP, experts: np.ndarray, anchored: bool) -> HostProblem:
 def _solve_with_progress(problem, tolerance: float, max_iterations: int, progress: bool) -> pdhg.PDHGState:
     """Runs the engine a few hundred iterations at a time, so that the host can report and be interrupted."""
     run, state = _solve_some, pdhg.init(problem)
-    if state.dual.size > _SMALL_WORK:
+    if programs.pays(_SECONDS * state.dual.size):
         run, problem, state = _run_engine, *jax.tree.map(checks.to_device, (problem.on_device(), state))
     with tqdm(total=max_iterations, desc="homomorphism", unit="iteration", disable=not progress) as bar:
         while int(state.steps[0]) < max_iterations and float(state.upper[0] - state.lower[0]) > tolerance:
@@ -190,4 +189,4 @@ def _solve_some(problem, state, tolerance, max_iterations) -> pdhg.PDHGState:
     return pdhg.solve(problem, state, tolerance=tolerance, max_iterations=max_iterations)
 
 
-_run_engine = host_jit(_solve_some)
+_run_engine = programs.host_jit(_solve_some)

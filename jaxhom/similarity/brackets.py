@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxhom import checks
+from jaxhom import checks, programs
 from jaxhom.similarity import interior_point
 from jaxhom.similarity.free_bounds import lower_bounds_without_iterations, upper_bounds_without_iterations
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
@@ -41,7 +41,6 @@ _SMALL_ROUNDING = 0.125  # of the tolerance: nothing is done about it
 NOISE = 32.0  # times eps: closer than that an iteration does not come
 _INTERIOR_BYTES = 2 * 2**20  # of a batch's normal matrices: a core's own cache
 _TIGHT = 1e-3  # wider gaps PDHG closes sooner
-_COMPILING = 2.0  # seconds that a program takes at least to compile
 _MAP_LANES = 8  # maps are asked for a few at a time
 
 
@@ -111,7 +110,7 @@ def choose_method(n: int, m: int, dtype, goal: Goal) -> str:
 def is_small_work(problem: HomomorphismProblem) -> bool:
     """Whether the host is done with a problem before its program would be compiled."""
     sizes = np.asarray(problem.source_size), np.asarray(problem.target_size)
-    return max(map(np.max, sizes)) <= MAX_INTERIOR_SIZE and seconds_on_host(*sizes).sum() <= _COMPILING
+    return max(map(np.max, sizes)) <= MAX_INTERIOR_SIZE and not programs.pays(float(seconds_on_host(*sizes).sum()))
 
 
 def bracket_errors(

@@ -12,12 +12,11 @@ import threading
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy
 
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import Certificate, adjoint, forward
 from jaxhom.solvers.blas_threads import one_blas_thread
-from jaxhom.solvers.lane_queue import is_settled, map_on_cores
+from jaxhom.solvers.lane_queue import is_settled, map_on_cores, num_cores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -27,8 +26,9 @@ if TYPE_CHECKING:
 MAX_ITERATIONS = 80  # ten to twenty are usual
 _TO_BOUNDARY = 0.995  # of the way: points stay positive
 _REGULARISATIONS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)  # shares of the diagonal, to be tried in turn
-_SMALL_TRIANGLE = 8  # rows
+_SMALL_TRIANGLE = 16  # rows
 _SECONDS, _GROWTH = 2e-6, 1.7  # of a pair, times (n m)^1.7: 0.5 ms for five states, 120 for 25
+_BATCHES_PER_CORE, _SHORT = 2, 0.05  # at least, of work that takes more seconds than that
 _LEAST_SHARE = 0.5  # of the work of a lane that its own size would make; a batch more costs some ten milliseconds
 _CHUNK_BYTES = 64 * 2**20  # of normal matrices at a time
 
@@ -83,12 +83,14 @@ def seconds_on_host(source_size: Int[np.ndarray, " P"], target_size: Int[np.ndar
 
 
 def _batches(source_size: Int[np.ndarray, " P"], target_size: Int[np.ndarray, " P"]) -> Iterator[Int[np.ndarray, " B"]]:
-    """The lanes, in batches of so similar sizes that at most half of the work is about padding."""
+    """The lanes, in batches of so similar sizes that at most half of the work is about padding, and for every core."""
     seconds = seconds_on_host(source_size, target_size)
+    most = max(seconds.sum() / (_BATCHES_PER_CORE * num_cores()), _SHORT)
     left = np.argsort(-seconds, kind="stable")
     while left.size:
         n, m = (np.maximum.accumulate(size[left]) for size in (source_size, target_size))
         fits = seconds[left] >= _LEAST_SHARE * seconds_on_host(n, m)
+        fits &= np.cumsum(seconds[left]) <= most
         fits &= np.arange(1, len(left) + 1) * (n * m) ** 2 <= _CHUNK_BYTES // (8 * 4)
         count = max(1, len(left) if fits.all() else int(fits.argmin()))
         yield left[:count]
@@ -223,12 +225,13 @@ def _factorise(models: _Models, d_plus, d_minus, d_f) -> Callable:
     size = rows * m
     is_free = free.reshape(lanes, size)
     normal = normal_matrices(models.source, models.target, d_plus + d_minus, first, *models.labels)
-    normal = np.where(is_free[:, :, None] & is_free[:, None], normal, 0.0)
+    if not is_free.all():
+        normal *= is_free[:, :, None] & is_free[:, None]
     index = np.arange(size)
     normal[:, index, index] += np.where(is_free, d_f[:, first:].reshape(lanes, size), 1.0)
     factor = _inverse_factors(normal)
     coupling = np.where(models.free, models.adjoint(d_plus - d_minus), 0.0)[:, first:].reshape(lanes, size)
-    on_rows = (factor.reshape(lanes, size, rows, m) * free[:, None]).sum(axis=3)
+    on_rows = (factor.reshape(lanes, size, rows, 1, m) @ free[:, None, :, :, None].astype(float))[..., 0, 0]
     behind = np.concatenate([on_rows, (factor @ coupling[..., None])], axis=2)  # W (E^T, c)
     border = behind.transpose(0, 2, 1) @ behind
     border[:, -1, -1] -= (d_plus + d_minus).sum(axis=(1, 2, 3))
@@ -260,7 +263,8 @@ def _inverse_factors(normal: Float[np.ndarray, "P D D"]) -> Float[np.ndarray, "P
     """
     index = np.arange(normal.shape[1])
     scale = 1.0 / np.sqrt(normal[:, index, index])
-    scaled = normal * scale[:, :, None] * scale[:, None]
+    scaled = normal * scale[:, :, None]
+    scaled *= scale[:, None]
     for share in _REGULARISATIONS:
         scaled[:, index, index] = 1.0 + share
         try:
@@ -275,10 +279,16 @@ def _inverse_factors(normal: Float[np.ndarray, "P D D"]) -> Float[np.ndarray, "P
 
 
 def _inverse_triangles(lower: Float[np.ndarray, "P D D"]) -> Float[np.ndarray, "P D D"]:
-    """The inverses of lower triangular matrices."""
-    if lower.shape[1] <= _SMALL_TRIANGLE:  # a call for each would take longer than what it saves
+    """The inverses of lower triangular matrices, by halves: products, which leave Python's lock to other threads."""
+    size = lower.shape[1]
+    if size <= _SMALL_TRIANGLE:
         return np.linalg.inv(lower)
-    return np.stack([scipy.linalg.lapack.dtrtri(one.T, lower=0)[0].T for one in lower])
+    half = size // 2
+    inverse = np.zeros_like(lower)
+    inverse[:, :half, :half] = first = _inverse_triangles(lower[:, :half, :half])
+    inverse[:, half:, half:] = second = _inverse_triangles(lower[:, half:, half:])
+    inverse[:, half:, :half] = -second @ (lower[:, half:, :half] @ first)
+    return inverse
 
 
 def normal_matrices(source, target, weight, first: int, source_labels=None, target_labels=None) -> np.ndarray:
@@ -301,7 +311,9 @@ def normal_matrices(source, target, weight, first: int, source_labels=None, targ
     scaled = own[..., :m].transpose(0, 3, 1, 2)[:, :, :, None] * into[:, first:].transpose(0, 1, 3, 2)[:, None]
     cross = scaled.reshape(lanes, m, n * n, num_actions) @ target.transpose(0, 3, 2, 1)
     cross = cross.reshape(lanes, m, n, n, m).transpose(0, 3, 1, 2, 4)  # [j, k, p, q]
-    matrix = -cross - cross.transpose(0, 3, 4, 1, 2)
+    matrix = np.empty(cross.shape)
+    np.add(cross, cross.transpose(0, 3, 4, 1, 2), out=matrix)
+    np.negative(matrix, out=matrix)
     k, j = np.arange(m), np.arange(n)
     matrix[:, :, k, :, k] += same_column.transpose(1, 0, 2, 3)
     matrix[:, j, :, j] += same_row.transpose(1, 0, 2, 3)

@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 import jaxhom
-from bench import instances, lp_peers, processes, speed, speed_report
+from bench import first_report, instances, lp_peers, processes, speed, speed_report
 from bench.linear_programs import Conic, Homomorphisms, Lpal
 from bench.lp_peers import Settings
 from bench.models import Model
@@ -267,3 +267,27 @@ def test_processes_share_lanes_and_are_ended_at_their_limit():
         patch.setattr(processes, "_START_UP", 0.0)
         processes.measure("planning_peers:opened", shared, pairs, 0.0)
     assert time.perf_counter() - start < 60.0
+
+
+def test_the_first_answer_has_a_table_and_bars():
+    def row(instance, method, cache, first, second=None, section="steps"):
+        times = {"first_s": str(first), "seconds": "" if second is None else str(second)}
+        fields = {"section": section, "instance": instance, "method": method, "cache": cache, "status": "measured"}
+        return {"draws": "1", "devices": "1", "prepare_s": "", "peak_gb": "", "settled": ""} | fields | times
+
+    rows = [
+        row("planning", "jaxhom", "none", 0.01, 0.008),
+        row("planning", "jaxhom", "kept", 0.009, 0.008),
+        row("planning", "quantecon", "none", 0.66, 0.004),
+        row("a command", "jaxhom", "none", 2.5),
+        row("pairs", "jaxhom", "", 0.5, 0.01, section="pairs_mixed"),
+    ]
+    text = first_report.table(rows)
+    assert "| planning | quantecon | none | 0.66 | 4 |" in text
+    assert "| a command | jaxhom | none | 2.5 |  |" in text
+    assert text.index("## steps") < text.index("## pairs")
+    (axes,) = first_report.figure(rows).axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["a command", "planning"]
+    widths = sorted(patch.get_width() for patch in axes.patches if patch.get_width())
+    assert widths == [0.009, 0.01, 0.66, 2.5]
+    assert first_report.figure(rows[-1:]) is None

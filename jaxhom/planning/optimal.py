@@ -77,8 +77,8 @@ def optimal_policy(
     mdp = as_model(mdp)
     reward, is_batch = _reward_batch(mdp, reward)
     xp = checks.arrays_of(mdp, reward, initial_value, tolerance)
-    initial_value = xp.asarray(0.0 if initial_value is None else initial_value, mdp.dtype)
-    if initial_value.shape in ((), (mdp.num_states,)):
+    initial_value = xp.asarray(np.zeros(mdp.num_states) if initial_value is None else initial_value, mdp.dtype)
+    if initial_value.shape == (mdp.num_states,):
         initial_value = xp.broadcast_to(initial_value, (reward.shape[0], mdp.num_states))
     good = initial_value.shape == (reward.shape[0], mdp.num_states)
     checks.require_shape("initial_value", initial_value, f"(..., {mdp.num_states})", good)

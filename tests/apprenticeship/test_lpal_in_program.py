@@ -176,7 +176,8 @@ def test_derivatives_are_those_outside(parameter, rng):
 
     value = expectations if parameter == "expectations" else getattr(mdp, parameter)
     inside, outside = jax.jit(jax.jacrev(bounds))(value), jax.jacrev(bounds)(value)
-    np.testing.assert_allclose(inside, outside, rtol=1e-4, atol=1e-6)
+    # Where a policy hardly ever is, the gap leaves open what it does: some 1e-8 of the largest derivative.
+    np.testing.assert_allclose(inside, outside, rtol=1e-4, atol=1e-7 * np.abs(outside).max())
 
 
 def test_derivatives_of_each_lane_under_vmap(rng):

@@ -10,9 +10,9 @@ import oracles
 import pytest
 
 import jaxhom
-from jaxhom import MDP, Demonstrations, SimilarityTable, Status, gridworld, racetrack
+from jaxhom import MDP, Demonstrations, SimilarityTable, Status, gridworld, programs, racetrack
 from jaxhom.generalization import votes_in_program
-from jaxhom.similarity import brackets, class_pairs
+from jaxhom.similarity import class_pairs
 
 EXACT = ("visited", "radius", "support", "undecided", "status")
 COUNT = 6  # draws
@@ -212,7 +212,7 @@ def test_what_could_not_be_decided_is_said(monkeypatch):
     pairs = np.indices((25, 25)).reshape(2, -1)
     errors = table.brackets(*pairs, tolerance=1e-7).lower
     beside = float(np.median(errors[errors > 0.1])) - 1e-6
-    monkeypatch.setattr(brackets, "_COMPILING", 0.0)  # all by programs, whose iterations are limited
+    monkeypatch.setattr(programs, "pays", lambda seconds: True)  # all by programs, whose iterations are limited
     monkeypatch.setattr(class_pairs, "_MAX_PRODUCTS", 0.0)
     monkeypatch.setattr(class_pairs, "_MIN_ITERATIONS", 1)
     options = {"threshold": beside, "tolerance": 1e-9}

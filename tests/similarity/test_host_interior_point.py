@@ -11,7 +11,8 @@ from jaxhom.similarity import brackets, newton
 from jaxhom.similarity.brackets import Goal, bracket_errors
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import forward
-from jaxhom.similarity.host_interior_point import normal_matrices, solve_on_host
+from jaxhom.similarity.host_interior_point import solve_on_host
+from jaxhom.similarity.host_normal_matrices import normal_matrices
 from jaxhom.status import Status
 
 

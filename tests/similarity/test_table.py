@@ -6,8 +6,8 @@ import numpy as np
 import oracles
 import pytest
 
-from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar
-from jaxhom.similarity import brackets, class_pairs
+from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar, programs
+from jaxhom.similarity import class_pairs
 from jaxhom.similarity.local_models import local_models
 
 
@@ -83,7 +83,7 @@ def test_a_pair_that_stays_open_is_tried_once_for_each_limit():
 def test_statuses_of_decisions(monkeypatch):
     """A pair is open only while neither direction is known to be too far."""
     near, far = (int(k) for k in (np.argmin(optima()), np.argmax(optima())))
-    monkeypatch.setattr(brackets, "_COMPILING", 0.0)  # all by programs, whose iterations are limited
+    monkeypatch.setattr(programs, "pays", lambda seconds: True)  # all by programs, whose iterations are limited
     monkeypatch.setattr(class_pairs, "_MAX_PRODUCTS", 0.0)
     monkeypatch.setattr(class_pairs, "_MIN_ITERATIONS", 1)
     table = SimilarityTable(model())

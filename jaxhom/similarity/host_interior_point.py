@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MAX_ITERATIONS = 80  # ten to twenty are usual
 _TO_BOUNDARY = 0.995  # of the way: points stay positive
 _SECONDS, _GROWTH = 2e-6, 1.7  # of a pair, times (n m)^1.7: 0.5 ms for five states, 120 for 25
-_BATCHES_PER_CORE, _SHORT = 2, 0.05  # at least, of work that takes more seconds than that
+_BATCHES_PER_CORE, _SHORT = 2, 0.05  # batches at least, of work that takes more seconds than that
 _LEAST_SHARE = 0.5  # of the work of a lane that its own size would make; a batch more costs some ten milliseconds
 _CHUNK_BYTES = 64 * 2**20  # of normal matrices at a time
 
@@ -71,8 +71,14 @@ def solve_on_host(
             whole.maps[lanes, : found.maps.shape[1], : found.maps.shape[2]] = found.maps
             progress(len(lanes))
 
+    sizes = np.asarray(problem.source_size), np.asarray(problem.target_size)
+    batches = list(_batches(*sizes))
     with one_blas_thread():
-        map_on_cores(work, list(_batches(np.asarray(problem.source_size), np.asarray(problem.target_size))))
+        if seconds_on_host(*sizes).sum() > _SHORT:
+            map_on_cores(work, batches)
+        else:  # before a thread would have begun
+            for lanes in batches:
+                work(lanes)
     return whole
 
 

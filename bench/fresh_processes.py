@@ -58,11 +58,10 @@ def _command(arguments: list[str], cache: str) -> dict:
 def _in_fresh_processes(once, cache: str, repeats: int) -> list:
     """What `once` returns, so many times: all without a folder for programs, or all but one with what that one kept."""
     with tempfile.TemporaryDirectory() as folder:
-        variables = {"NUMBA_CACHE_DIR": os.path.join(folder, "numba")}
-        if cache == "none":
-            return [once(folder, variables | {"JAXHOM_CACHE": "off"}) for _ in range(repeats)]
-        variables |= {"JAXHOM_CACHE": os.path.join(folder, "programs")}
-        return [once(folder, variables) for _ in range(1 + repeats)][1:]
+        if cache == "none":  # neither JAX nor Numba finds anything
+            numba = [os.path.join(folder, f"numba{number}") for number in range(repeats)]
+            return [once(folder, {"JAXHOM_CACHE": "off", "NUMBA_CACHE_DIR": place}) for place in numba]
+        return [once(folder, {"JAXHOM_CACHE": os.path.join(folder, "kept")}) for _ in range(1 + repeats)][1:]
 
 
 def _output(arguments: list[str], folder: str, variables: dict) -> str:

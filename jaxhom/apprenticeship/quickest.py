@@ -3,9 +3,9 @@
 Where all expectations can be exceeded at once, the best policy mixes about as many deterministic ones as there are
 features, and each column adds one. If the model's graph is a narrow band, the interior point then takes a tenth as many
 steps, each a few times as long as a column; and in batches PDHG closes half of the lanes for less than either. On a
-small model the interior point's few steps beat what a policy to begin with saves. For features that overlap, for few
-features, with a good guess, and on all other models, columns are the quickest; lanes in which they do not get on go to
-the interior point.
+small model the interior point beats what a policy to begin with saves, unless the expectations are a policy's. For
+features that overlap, for few features, with a good guess, and on all other models, columns are the quickest; lanes in
+which they do not get on go to the interior point.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def solve_by_the_quickest(request: Request) -> Found:
     if mdp.dtype != jnp.float64 or mdp.num_features < _MANY_FEATURES or not is_banded(model):
         return solve_by_columns(request)
     is_few = len(request.lanes) < _MANY_LANES
-    if is_few and request.weights is None and _is_small(model):
+    if is_few and request.weights is None and _is_small(model) and not _are_a_policys(request):
         return in_turn(request, solve_by_interior_point, solve_by_columns)
     is_guided = request.policy is not None or request.weights is not None
     if is_guided or model.once(_most_features_of_a_pair) > 1 or _are_a_policys(request):

@@ -65,7 +65,7 @@ def figure(rows: list[dict]) -> Figure | None:
     axes.set(xscale="log", xlabel="seconds of the first call in a fresh process")
     axes.set_yticks(range(len(steps)), steps, fontsize=8)
     axes.margins(x=0.15, y=0.02)
-    axes.legend(fontsize=8, loc="lower right")
+    drawn.legend(fontsize=8, loc="outside upper right", ncols=len(_KINDS))
     return drawn
 
 

@@ -17,6 +17,7 @@ from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
 from jaxhom.generalization.explanation import Explanation
+from jaxhom.generalization.model_map import SoftHomomorphism
 from jaxhom.generalization.neighbors import nearest_neighbors
 from jaxhom.generalization.regression import occupancy_regression
 from jaxhom.generalization.result import Generalization
@@ -60,6 +61,7 @@ __all__ = [
     "Plan",
     "Racetrack",
     "SimilarityTable",
+    "SoftHomomorphism",
     "Status",
     "TileMap",
     "agreement",

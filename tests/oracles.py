@@ -234,13 +234,15 @@ def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
     return result.fun, result.x[:-1].reshape(n, m)
 
 
-def global_homomorphism_lp(transition, visited):
+def global_homomorphism_lp(transition, visited, labels=None):
     """LP (8) from the model on all states to M^E on the visited ones: (error, map [S, |S^E|]).
 
-    `visited` is bool [S]; the columns of the map are the visited states in increasing order.
+    `visited` is bool [S]; the columns of the map are the visited states in increasing order. `labels` [S, A, L] are
+    kept as well, see `homomorphism_lp`.
     """
     restricted = restrict(transition, np.flatnonzero(visited).tolist())
-    return homomorphism_lp(transition, restricted, anchored=False)
+    pair = None if labels is None else (labels, labels[visited])
+    return homomorphism_lp(transition, restricted, anchored=False, labels=pair)
 
 
 # ---------------------------------------------------------------------------- generalization

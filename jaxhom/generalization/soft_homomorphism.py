@@ -35,7 +35,7 @@ def soft_homomorphism(
     mdp: MDP,
     demonstrations: Demonstrations,
     *,
-    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
+    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | Num[ArrayLike, "S A"] | None = None,
     target_labels: None = None,
     label_weight: Float[ArrayLike, ""] = 1.0,
     anchored: bool = True,
@@ -50,8 +50,8 @@ def soft_homomorphism(
     mdp: MDP,
     demonstrations: MDP,
     *,
-    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
-    target_labels: Num[ArrayLike, "T A L"] | Num[ArrayLike, "T L"] | None = None,
+    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | Num[ArrayLike, "S A"] | None = None,
+    target_labels: Num[ArrayLike, "T A L"] | Num[ArrayLike, "T L"] | Num[ArrayLike, "T A"] | None = None,
     label_weight: Float[ArrayLike, ""] = 1.0,
     anchored: bool = True,
     tolerance: float = 1e-3,
@@ -65,8 +65,8 @@ def soft_homomorphism(
     mdp: MDP,
     demonstrations: Demonstrations | MDP,
     *,
-    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
-    target_labels: Num[ArrayLike, "T A L"] | Num[ArrayLike, "T L"] | None = None,
+    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | Num[ArrayLike, "S A"] | None = None,
+    target_labels: Num[ArrayLike, "T A L"] | Num[ArrayLike, "T L"] | Num[ArrayLike, "T A"] | None = None,
     label_weight: Float[ArrayLike, ""] = 1.0,
     anchored: bool = True,
     tolerance: float = 1e-3,
@@ -85,9 +85,9 @@ def soft_homomorphism(
         these. Or the target, a model (or what has one as `.mdp`) of S' states with as many actions and of the same
         type: T' is its transitions.
       labels: what the map has to keep besides transitions, [S, A, L], or [S, L] for labels of the state, which count
-        for every action. Labels in [0, 1] weigh like probabilities; the reward is kept as `labels=reward[..., None]`.
-        Where an action is not allowed they count as given, and as 0 where not finite.
-      target_labels: [S', A, L] or [S', L], those of the target; with demonstrations the states' own labels are meant.
+        for every action; [S, A], a reward say, is one label of every action, also where L = A is meant. Labels in
+        [0, 1] weigh like probabilities. Where an action is not allowed they count as given, and as 0 where not finite.
+      target_labels: [S', A, L], [S', L] or [S', A], those of the target; with demonstrations the states' own labels are meant.
       label_weight: scalar, not negative, that all labels are multiplied by.
       anchored: map each demonstrated state to itself; False is the program as printed. Of demonstrations alone.
       tolerance: gap between the bounds on the optimal error to settle for.

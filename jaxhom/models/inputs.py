@@ -149,7 +149,7 @@ def check_reward_values(
 
 def check_labels(
     mdp: MDP,
-    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"],
+    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | Num[ArrayLike, "S A"],
     label_weight: Num[ArrayLike, ""] = 1.0,
     name: str = "labels",
 ) -> Float[Array | np.ndarray, "S A L"]:
@@ -159,7 +159,8 @@ def check_labels(
 
     Args:
       mdp: the model.
-      labels: [S, A, L], or [S, L] for labels of the state, which count for every action.
+      labels: [S, A, L], or [S, L] for labels of the state, which count for every action. [S, A], a reward say, is one
+        label of every action.
       label_weight: scalar, not negative.
       name: what to call the labels in messages.
 
@@ -171,7 +172,9 @@ def check_labels(
     is_traced = checks.is_traced(labels, mdp.allowed)
     xp = jnp if is_traced else np
     labels = jnp.asarray(labels, mdp.dtype) if is_traced else checks.as_host_array(name, labels)
-    by_state = labels.ndim == 2 and labels.shape[0] == states
+    by_state = labels.ndim == 2 and labels.shape[0] == states and labels.shape != (states, actions)
+    if labels.shape == (states, actions):
+        labels = labels[..., None]
     by_pair = labels.ndim == 3 and labels.shape[:2] == (states, actions)
     checks.require_shape(name, labels, f"({states}, {actions}, L) or ({states}, L)", by_state or by_pair)
     checks.require_shape("label_weight", label_weight, "()", np.ndim(label_weight) == 0)

@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.graph import host_graph
-from jaxhom.models.inputs import as_model, check_states
+from jaxhom.models.inputs import as_model, check_labels, check_states
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
-from jaxhom.similarity.class_pairs import ClassPairs
+from jaxhom.similarity.class_pairs import ClassModels
 from jaxhom.similarity.classes import ClassBook
 from jaxhom.similarity.decisions import (
     Decisions,
@@ -30,11 +30,12 @@ from jaxhom.similarity.decisions import (
 )
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
-from jaxhom.similarity.pair_bounds import PairBounds, pair_keys
+from jaxhom.similarity.pair_bounds import PairBounds, pair_keys, pair_set
+from jaxhom.similarity.relations import UserRelation, pair_errors
 from jaxhom.solvers.lane_queue import is_settled
 
 if TYPE_CHECKING:
-    from jaxtyping import ArrayLike, Int
+    from jaxtyping import ArrayLike, Int, Num
 
 _MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}  # below what an explanation prints
 
@@ -45,14 +46,32 @@ class SimilarityTable:
     Args:
       mdp: the model, concrete; or what has one as `.mdp`.
       distance: d >= 1, the radius of the local models.
-      anchored: require that the centre is mapped to the centre; False is the program as printed.
+      anchored: require that the centre is mapped to the centre; False is the program as printed. Graph kernels then
+        tell the centre from other states no more.
+      labels: [S, A, L], or [S, L] for labels of the state, what a map has to keep besides transitions: the error also
+        bounds |l(i, a) - sum_k f(i, k) l'(k, a)| for every label. A reward [S, A] is one label, `mdp.features` are K.
+        They count as they are: in [0, 1] a difference weighs like one of probabilities.
+      label_weight: what labels are multiplied by.
+      relation: what the errors of a pair of local models are.
+
+        * "homomorphism": the error of LP (9).
+        * "isomorphic": 0 if the models are equal up to a renaming of states that keeps the centre, or else 1.
+        * "weisfeiler_lehman": 1 - k for the subtree kernel of colours in three rounds of refinement (Shervashidze et
+          al. 2011), normalised; colours are of probabilities, labels and actions, along transitions both ways.
+        * "random_walk": 1 - k for the walks that both models have in common (Vishwanathan et al. 2007), normalised.
+        * "lax": the error of LP (9), the least over all permutations of the target's actions, up to 6 of them
+          (Taylor et al. 2008). Votes are renamed back by the permutation.
+        * a function of two local models, source and target, with `.states`, `.transition` [n, A, n] and `.labels`
+          [n, A, L] or None in NumPy: it returns whether they are similar, an error of at least 0, or bounds on one.
 
     Attributes:
       mdp, distance, anchored: as given.
+      labels: [S, A, L], weighted; None if none were given.
+      compares: the relation as given; its name if it is a function.
       num_solved: how many programs have been solved, each for a pair of classes.
 
     Raises:
-      ValueError: if the model is traced or the distance below 1.
+      ValueError: if the model is traced, an option out of range, or labels do not fit.
 
     The table grows by what it is asked; it belongs to the host and is no pytree. It takes concrete values alone, inside
     jit, vmap and grad too. Completed, it answers for traced demonstrations: see `complete`.
@@ -71,22 +90,52 @@ class SimilarityTable:
     """
 
     @checks.eager_where_concrete
-    def __init__(self, mdp: MDP, *, distance: int = 1, anchored: bool = True):
+    def __init__(
+        self,
+        mdp: MDP,
+        *,
+        distance: int = 1,
+        anchored: bool = True,
+        labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
+        label_weight: float = 1.0,
+        relation: str | UserRelation = "homomorphism",
+    ):
         self.mdp = as_model(mdp)
         require_concrete(self.mdp)
+        checks.refuse_traced(labels=labels, label_weight=label_weight)
         self.distance, self.anchored = checks.require_count("distance", distance), bool(anchored)
-        self._maker = LocalModelMaker(host_graph(self.mdp), self.distance)
+        self.labels = None if labels is None else check_labels(self.mdp, labels, label_weight)
+        self.given_relation = relation
+        self._maker = LocalModelMaker(host_graph(self.mdp), self.distance, self.labels)
         self._book = ClassBook(self._maker)
-        self._pairs = ClassPairs(self._maker, self._book, self.anchored)
+        self._pairs = pair_errors(relation, ClassModels(self._maker, self._book), self.anchored)
         self._known = PairBounds(self.mdp.dtype)
         self._maps: dict[tuple[int, int], tuple[np.ndarray, LocalSimilarity]] = {}
 
     def __repr__(self) -> str:
         kind = "anchored" if self.anchored else "as printed"
+        kind += "" if self.compares == "homomorphism" else f", {self.compares}"
+        kind += "" if self.labels is None else f", {self.labels.shape[2]} labels"
         return (
             f"SimilarityTable({self.mdp.num_states} states, distance {self.distance}, {kind}; so far "
             f"{self.num_classes} classes, {len(self._known)} pairs of them)"
         )
+
+    @property
+    def compares(self) -> str:
+        """The name of the relation."""
+        given = self.given_relation
+        return given if isinstance(given, str) else getattr(given, "__name__", type(given).__name__)
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether a map stands behind an error: of LP (9), "homomorphism" and "lax"."""
+        return self._pairs.has_maps
+
+    @property
+    def renames(self) -> bool:
+        """Whether actions of a target may stand for others of a source: the relation "lax"."""
+        return self.given_relation == "lax"
 
     @property
     def num_classes(self) -> int:
@@ -157,22 +206,33 @@ class SimilarityTable:
         *,
         mutual: bool = False,
         tolerance: float = 1e-4,
+        with_errors: bool = False,
         progress: bool = False,
     ) -> Decisions:
-        """As `decide`, and says which of the pairs that count as different could not be decided, and why."""
+        """As `decide`, and says which of the pairs that count as different could not be decided, and why.
+
+        With errors, those of similar pairs are bracketed to the tolerance; if mutual, the larger of both directions.
+        """
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
+        back = pairs[:, ::-1]
         if mutual:
-            back = pairs[:, ::-1]
             is_asked = ~is_far(self._known.look_up(back), goal)
             self._settle(pairs[is_asked], goal, progress)
             self._settle(back[is_asked & is_similar(self._known.look_up(pairs), goal)], goal, progress)
         else:
             self._settle(pairs, goal, progress)
-        return jax.tree.map(lambda leaf: leaf[where], self._decided(pairs, goal, mutual))
+        found = self._decided(pairs, goal, mutual)
+        if with_errors:
+            ways = [pairs, back][: 1 + mutual]
+            self._settle(pair_set(np.concatenate([way[found.similar] for way in ways])), Goal(tolerance), progress)
+            found = found.replace(error=self._errors_of(ways, tolerance))
+        return jax.tree.map(lambda leaf: leaf[where], found)
 
     @checks.eager_where_concrete
-    def complete(self, threshold: float = 0.0, *, tolerance: float = 1e-4, progress: bool = False) -> SimilarityTable:
+    def complete(
+        self, threshold: float = 0.0, *, tolerance: float = 1e-4, with_errors: bool = False, progress: bool = False
+    ) -> SimilarityTable:
         """Decides e <= threshold for all ordered pairs of classes of the model, and returns the table.
 
         Then `soft_local_homomorphism(..., threshold=threshold, table=table)` solves nothing any more, for whatever
@@ -182,6 +242,7 @@ class SimilarityTable:
         Args:
           threshold: epsilon >= 0.
           tolerance: an error up to threshold + tolerance may count as similar.
+          with_errors: bracket the errors of similar pairs to the tolerance too, which weights="similarity" needs.
           progress: show a progress bar.
 
         Raises:
@@ -195,17 +256,24 @@ class SimilarityTable:
         """
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         self.classes()
-        self._settle(every_pair(self.num_classes), goal, progress)
+        pairs = every_pair(self.num_classes)
+        self._settle(pairs, goal, progress)
+        similar = pairs[is_similar(self._known.look_up(pairs), goal)]
+        if with_errors:
+            self._settle(similar, Goal(tolerance), progress)
+        self._pairs.renamings(similar)
         return self
 
     @checks.eager_where_concrete
-    def relation(self, threshold: float = 0.0, *, mutual: bool = False, tolerance: float = 1e-4) -> Relation:
+    def relation(
+        self, threshold: float = 0.0, *, mutual: bool = False, tolerance: float = 1e-4, with_errors: bool = False
+    ) -> Relation:
         """Which classes are similar, as `decisions` says it of their states; of a completed table, without solving.
 
         Args:
           threshold: epsilon >= 0, one that the table was completed for.
           mutual: require the error of both directions to be within the threshold.
-          tolerance: as it was when the table was completed.
+          tolerance, with_errors: as they were when the table was completed.
 
         Returns:
           `Relation`.
@@ -223,9 +291,32 @@ class SimilarityTable:
             )
         pairs = every_pair(self.num_classes)
         require_decided(self._is_to_solve(pairs, goal), threshold, tolerance)
-        found = self._decided(pairs, goal, mutual)
-        square = (self.num_classes,) * 2
-        return Relation(label=label, similar=found.similar.reshape(square), status=found.status.reshape(square))
+        found, square = self._decided(pairs, goal, mutual), (self.num_classes,) * 2
+        relation = Relation(label=label, similar=found.similar.reshape(square), status=found.status.reshape(square))
+        if with_errors:
+            ways = [pairs, pairs[:, ::-1]][: 1 + mutual]
+            is_open = [found.similar & self._is_to_solve(way, Goal(tolerance)) for way in ways]
+            require_decided(np.concatenate(is_open), threshold, tolerance, ", with_errors=True")
+            relation = relation.replace(error=self._errors_of(ways, tolerance).reshape(square))
+        if self.renames:
+            renaming = np.zeros((*square, self.mdp.num_actions), np.int32)
+            renaming[relation.similar] = self._pairs.renamings(pairs[found.similar])
+            relation = relation.replace(renaming=renaming)
+        return relation
+
+    @checks.eager_where_concrete
+    def renamings(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> np.ndarray | None:
+        """int [P, A]: which action of the target stands for each of the source's; None where each is itself.
+
+        For the relation "lax": the permutation of least error, of those as good to 1e-4 the first one that renames the
+        fewest actions.
+
+        Raises:
+          ValueError: as `local_similarity`.
+        """
+        pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
+        found = self._pairs.renamings(pairs)
+        return None if found is None else found[where]
 
     @checks.eager_where_concrete
     def maps(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> CertifiedMaps:
@@ -236,15 +327,18 @@ class SimilarityTable:
           targets: int [P], its s'.
 
         Returns:
-          `CertifiedMaps`; the bounds are 1e-6 apart (1e-4 in float32), or `status` says why not.
+          `CertifiedMaps`; the bounds are 1e-6 apart (1e-4 in float32), or `status` says why not. Of the relation "lax"
+          they are the maps to models with renamed actions, see `renamings`.
 
         Raises:
-          ValueError: as `local_similarity`.
+          ValueError: as `local_similarity`; or if the relation is one without maps.
 
         A map between the models that stand for two classes is solved for once, and carried over by renaming states.
 
         Source: Boularias and Chaib-draa 2010, eq. (9).
         """
+        if not self.has_maps:
+            raise ValueError(f"there are no maps behind the relation {self.compares}")
         sources, targets = self._validated_pairs(sources, targets)
         pairs, where = self._pairs_of(sources, targets)
         goal = Goal(tolerance=_MAP_TOLERANCE[np.dtype(self.mdp.dtype).name], method="pdhg")
@@ -292,6 +386,10 @@ class SimilarityTable:
         """What is known of pairs of classes [Q, 2], in both directions if `mutual`."""
         back = self._known.look_up(pairs[:, ::-1]) if mutual else None
         return decisions_of(self._known.look_up(pairs), goal, back)
+
+    def _errors_of(self, ways: list[np.ndarray], tolerance: float) -> np.ndarray:
+        """[Q]: upper bounds on the errors of pairs of classes [Q, 2]; the largest of those of each pair's ways."""
+        return np.maximum.reduce([self._widened(way, Goal(tolerance)).upper for way in ways])
 
     def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""

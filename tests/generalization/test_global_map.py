@@ -39,7 +39,7 @@ def shown():
 def labels_of(kind):
     rng = np.random.default_rng(7)
     return {
-        "of states": 2 * rng.uniform(size=(STATES, 2)),
+        "of states": 2 * rng.uniform(size=(STATES, 3)),
         "of pairs": rng.uniform(size=(STATES, ACTIONS, 3)),
         "large, far from 0": 1e4 + 30 * rng.uniform(size=(STATES, ACTIONS, 1)),
         "numbers": np.arange(STATES)[:, None],
@@ -121,6 +121,13 @@ def test_the_weight_multiplies():
     np.testing.assert_array_equal(found.policy, expected.policy)
     nothing = soft_homomorphism(model(), shown(), labels=labels, label_weight=0)
     np.testing.assert_allclose(nothing.policy, soft_homomorphism(model(), shown()).policy, rtol=0, atol=1e-9)
+
+
+def test_a_reward_is_one_label_of_every_action():
+    reward = labels_of("of pairs")[..., 0]
+    found, expected = (soft_homomorphism(model(), shown(), labels=labels) for labels in (reward, reward[..., None]))
+    np.testing.assert_array_equal(found.error_upper, expected.error_upper)
+    np.testing.assert_array_equal(found.policy, expected.policy)
 
 
 def test_weights_side_by_side_in_one_program():

@@ -85,9 +85,10 @@ def soft_homomorphism(
         these. Or the target, a model (or what has one as `.mdp`) of S' states with as many actions and of the same
         type: T' is its transitions.
       labels: what the map has to keep besides transitions, [S, A, L], or [S, L] for labels of the state, which count
-        for every action; [S, A], a reward say, is one label of every action, also where L = A is meant. Labels in
+        for every action; [S, A], a reward say, is one label of every action, even if L = A was meant. Labels in
         [0, 1] weigh like probabilities. Where an action is not allowed they count as given, and as 0 where not finite.
-      target_labels: [S', A, L], [S', L] or [S', A], those of the target; with demonstrations the states' own labels are meant.
+      target_labels: those of the target, likewise [S', A, L], [S', L] or [S', A]; None with demonstrations, where the
+        states' own labels are meant.
       label_weight: scalar, not negative, that all labels are multiplied by.
       anchored: map each demonstrated state to itself; False is the program as printed. Of demonstrations alone.
       tolerance: gap between the bounds on the optimal error to settle for.

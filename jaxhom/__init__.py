@@ -18,6 +18,7 @@ from jaxhom.domains.tile_map import TileMap
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
 from jaxhom.generalization.choice import choose_generalization
 from jaxhom.generalization.explanation import Explanation
+from jaxhom.generalization.model_map import SoftHomomorphism
 from jaxhom.generalization.neighbors import nearest_neighbors
 from jaxhom.generalization.regression import occupancy_regression
 from jaxhom.generalization.result import Generalization
@@ -61,6 +62,7 @@ __all__ = [
     "Plan",
     "Racetrack",
     "SimilarityTable",
+    "SoftHomomorphism",
     "Status",
     "TileMap",
     "agreement",

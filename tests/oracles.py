@@ -192,14 +192,14 @@ def homomorphism_residual(source, target, mapping):
     return np.max(np.abs(through_source - through_target))
 
 
-def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
+def homomorphism_lp(source, target, anchored=True, labels=None, refused=False, pinned=()):
     """LP (9) between `source` [n, A, n] and `target` [m, A, m]: (error, map [n, m]).
 
     Minimise e over f >= 0 with sum_k f(i, k) = 1 and, for all i, k, a,
     |sum_j T(i, a, j) f(j, k) - sum_j f(i, j) T'(j, a, k)| <= e.
     `anchored` requires in addition f(0, 0) = 1: state 0 is the centre of both models. `labels`, [n, A, L] and
     [m, A, L], add |l(i, a) - sum_k f(i, k) l'(k, a)| <= e for every label. `refused`: the last state of each model is
-    mapped to the other, and nothing else is.
+    mapped to the other, and nothing else is. `pinned`: pairs (i, k) with f(i, k) = 1.
     The variables are f, row by row, and e.
     """
     n, num_actions, _ = source.shape
@@ -220,6 +220,8 @@ def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
     bounds = [(0.0, None)] * (n * m + 1)
     if anchored:
         bounds[0] = (1.0, 1.0)
+    for i, k in pinned:
+        bounds[i * m + k] = (1.0, 1.0)
     if refused:
         for i in range(n):
             bounds[i * m + m - 1] = (float(i == n - 1),) * 2
@@ -318,13 +320,16 @@ def walk_kernel(source, target, steps, anchored=True, labels=None, continuation=
     return sum(pairs) / len(pairs)
 
 
-def global_homomorphism_lp(transition, visited):
+def global_homomorphism_lp(transition, visited, labels=None, anchored=False):
     """LP (8) from the model on all states to M^E on the visited ones: (error, map [S, |S^E|]).
 
-    `visited` is bool [S]; the columns of the map are the visited states in increasing order.
+    `visited` is bool [S]; the columns of the map are the visited states in increasing order. `labels` [S, A, L] are
+    kept as well, see `homomorphism_lp`; `anchored` maps every visited state to itself.
     """
-    restricted = restrict(transition, np.flatnonzero(visited).tolist())
-    return homomorphism_lp(transition, restricted, anchored=False)
+    experts = np.flatnonzero(visited).tolist()
+    pair = None if labels is None else (labels, labels[visited])
+    pinned = [(s, k) for k, s in enumerate(experts) if anchored]
+    return homomorphism_lp(transition, restrict(transition, experts), anchored=False, labels=pair, pinned=pinned)
 
 
 # ---------------------------------------------------------------------------- generalization

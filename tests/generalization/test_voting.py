@@ -10,6 +10,7 @@ from small_models import dense_transition
 
 from jaxhom import MDP, Demonstrations, SimilarityTable, disjoint_union, gridworld, soft_local_homomorphism
 
+WEIGHTED = {"voters": 2, "weights": "similarity", "threshold": 0.2}
 RELATIONS = ["homomorphism", "isomorphic", "weisfeiler_lehman", "random_walk", "lax"]
 
 
@@ -139,11 +140,13 @@ def test_the_same_inside_programs(name, options):
     np.testing.assert_allclose(batched.policy, np.stack([outside.policy] * 2), atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore::jaxhom.ImpossibleStepsWarning")
 def test_weights_inside_programs_need_errors():
-    mdp, demonstrations, _ = world("grid")
-    table = SimilarityTable(mdp).complete(0.3)
-    learn = functools.partial(soft_local_homomorphism, mdp, table=table, threshold=0.3, weights="similarity")
-    with pytest.raises(ValueError, match=r"call table.complete\(threshold=0.3, with_errors=True\) first"):
+    mdp, demonstrations, labels = world("random")
+    table = SimilarityTable(mdp, labels=labels).complete(0.8)
+    options = {"table": table, "threshold": 0.8, "weights": "similarity"}
+    learn = functools.partial(soft_local_homomorphism, mdp, labels=labels, **options)
+    with pytest.raises(ValueError, match=r"call table.complete\(threshold=0.8, with_errors=True\) first"):
         jax.jit(learn)(demonstrations)
 
 
@@ -161,14 +164,14 @@ def test_explanations_add_up(name, relation, rule):
         assert len(why.voters) == general.support[state]
         if not len(why.voters):
             continue
-        np.testing.assert_allclose(why.weights @ why.voter_policies, general.policy[state], atol=1e-6)
+        np.testing.assert_allclose(why.weights @ why.voter_policies, general.policy[state], atol=1e-4)
         if general.visited[state]:
             continue
         assert (why.forward is None) == (relation not in ("homomorphism", "lax"))
         assert (why.renamings is None) == (relation != "lax")
         assert np.all(why.upper <= rule.get("threshold", 0.0) + 2e-4)
         text = str(why)
-        assert "error e" in text and (relation == "homomorphism" or relation in text) and "1 labels" in text
+        assert "error e" in text and (relation == "homomorphism" or relation in text) and "1 label" in text
         if relation == "lax":
             assert "its actions renamed" in text
 

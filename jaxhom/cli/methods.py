@@ -16,12 +16,17 @@ import numpy as np
 
 from jaxhom.cli.options import Parser, positive
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
+from jaxhom.generalization.choice import choose_generalization
 from jaxhom.generalization.neighbors import nearest_neighbors
 from jaxhom.generalization.regression import occupancy_regression
 from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.generalization.voting import WEIGHTS
 from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.inputs import check_labels
+from jaxhom.similarity.lax_pairs import MAX_ACTIONS
+from jaxhom.similarity.relations import RELATIONS
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
@@ -34,13 +39,28 @@ Found = tuple[Generalization, dict[str, Any]]
 def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, **settings) -> Found:
     if problem.terminal is not None:  # no action matters there, and their local models can be large
         states = ~problem.terminal if states is None else states & ~problem.terminal
-    table = problem.similarity(settings.get("distance", 1), anchored=not printed)
+    if "labels" in settings:
+        settings["labels"] = problem.labels(settings["labels"])
+    compared = {name: settings[name] for name in ("labels", "label_weight", "relation") if name in settings}
+    table = problem.similarity(settings.get("distance", 1), anchored=not printed, **compared)
     options = {**settings, "anchored": not printed, "mutual": mutual, "table": table, "progress": progress}
     found = soft_local_homomorphism(problem.mdp, demonstrations, states=states, **options)
     return found, {"classes_of_local_models": table.num_classes, "pairs_of_classes_solved": table.num_solved}
 
 
+def _choose(problem, demonstrations, progress, states, **settings) -> Found:
+    if "labels" in settings:
+        settings["labels"] = problem.labels(settings["labels"])
+    if problem.terminal is not None:
+        states = ~problem.terminal
+    choice = choose_generalization(problem.mdp, demonstrations, states=states, progress=progress, **settings)
+    names, scores = list(choice.scores), list(choice.scores.values())
+    return choice.best, {"chosen": choice.name, "candidates": names, "scores": scores}
+
+
 def _global(problem, demonstrations, progress, _, *, printed=False, **settings) -> Found:
+    if "labels" in settings:
+        settings["labels"] = problem.labels(settings["labels"])
     found = soft_homomorphism(problem.mdp, demonstrations, anchored=not printed, progress=progress, **settings)
     return found, {name: float(np.asarray(getattr(found, name))) for name in ("error_lower", "error_upper")}
 
@@ -60,6 +80,10 @@ def _regression(problem, demonstrations, *_) -> Found:
         raise ValueError(str(error)) from None
 
 
+def _voters(text: str) -> str | int:
+    return text if text in ("nearest", "all") else positive(text)
+
+
 @dataclasses.dataclass(frozen=True)
 class Method:
     """A method's name in tables, what runs it, and its options; without a function it generalizes nothing."""
@@ -69,11 +93,19 @@ class Method:
     options: tuple[str, ...] = ()
 
 
+_COMPARED = ("labels", "label_weight")
+_VOTES = ("voters", "weights", "temperature")
+
 METHODS = {
     "soft-local-homomorphism": Method(
-        "soft local homomorphism", _local, ("distance", "threshold", "mutual", "printed", "tolerance")
+        "soft local homomorphism",
+        _local,
+        ("distance", "threshold", "mutual", "printed", "tolerance", *_COMPARED, "relation", *_VOTES),
     ),
-    "soft-homomorphism": Method("soft homomorphism, LP (8)", _global, ("printed", "tolerance", "max_iterations")),
+    "choose": Method("generalization chosen by the data", _choose, ("distance", *_COMPARED)),
+    "soft-homomorphism": Method(
+        "soft homomorphism, LP (8)", _global, ("printed", "tolerance", "max_iterations", *_COMPARED)
+    ),
     "nearest-neighbors": Method("k-NN", _nearest, ("metric",)),
     "maximum-entropy": Method("maximum entropy", _uniform),
     "regression": Method("regression", _regression),
@@ -93,6 +125,20 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "T",
         "help": "of the homomorphism's linear programs (default 1e-4 local, 1e-3 global)",
     },
+    "labels": {
+        "metavar": "FILE",
+        "help": "what similar states have in common besides transitions: features or reward, the model's own, or an "
+        ".npy file of [S, A, L] or [S, L]",
+    },
+    "label_weight": {"type": float, "metavar": "W", "help": "what labels are multiplied by (default 1)"},
+    "relation": {"choices": RELATIONS, "help": "what makes states similar (default homomorphism)"},
+    "voters": {
+        "type": _voters,
+        "metavar": "N",
+        "help": "who votes: nearest (default), all, or a number of the nearest at least",
+    },
+    "weights": {"choices": WEIGHTS, "help": "of votes (default equal)"},
+    "temperature": {"type": float, "metavar": "T", "help": "of weights by similarity (default 0.1)"},
     "max_iterations": {"type": positive, "metavar": "N", "help": "of the global program (default 20000)"},
     "metric": {
         "choices": ("hops", "euclidean"),
@@ -143,6 +189,16 @@ def check_method(problem: Problem, options: argparse.Namespace) -> None:
         raise ValueError(f"--threshold must not be negative, got {settings['threshold']}")
     if not settings.get("tolerance", 1.0) > 0.0:
         raise ValueError(f"--tolerance must be positive, got {settings['tolerance']}")
+    if not 0.0 < settings.get("temperature", 1.0) < np.inf:
+        raise ValueError(f"--temperature must be positive and finite, got {settings['temperature']}")
+    for name, owner in (("label_weight", "labels"), ("temperature", "weights")):
+        if name in settings and owner not in settings:
+            raise ValueError(f"{_flag(name)} belongs to {_flag(owner)}")
+    if settings.get("relation") == "lax" and problem.mdp.num_actions > MAX_ACTIONS:
+        count = problem.mdp.num_actions
+        raise ValueError(f"--relation lax is for up to {MAX_ACTIONS} actions, and {problem.name} has {count}")
+    if "labels" in settings:
+        check_labels(problem.mdp, problem.labels(settings["labels"]), settings.get("label_weight", 1.0), "--labels")
     if options.method == "regression" or settings.get("metric") == "euclidean":
         what = "--metric euclidean" if "metric" in settings else "--method regression"
         if problem.coordinates is None:

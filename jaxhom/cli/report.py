@@ -90,6 +90,10 @@ class Report:
             rows.append((f"  advice from radius {levels[shown]} to {levels[-1]}", str(counts[shown:].sum())))
         rows.append(("states without a vote (uniform policy)", _share(nothing)))
         rows += self._how_it_ended(general)
+        if "chosen" in numbers:
+            rows.append(("chosen", str(numbers["chosen"])))
+            scores = zip(numbers["candidates"], numbers["scores"], strict=True)
+            rows += [(f"  log-likelihood of a step left out, {name}", f"{score:.4f}") for name, score in scores]
         if "error_lower" in numbers:
             rows.append(("error of the map", bracket(numbers["error_lower"], numbers["error_upper"])))
         if "pairs_of_classes_solved" in numbers:

@@ -79,16 +79,41 @@ class Problem:
             raise ValueError(f"{self.name} has no reward (array 'reward')")
         return optimal_policy(self.mdp, self.reward)
 
-    def similarity(self, distance: int = 1, *, anchored: bool = True) -> SimilarityTable:
-        """The table of the model's local models, one for all sets of demonstrations: no pair is solved again."""
+    def similarity(self, distance: int = 1, *, anchored: bool = True, **compared: Any) -> SimilarityTable:
+        """The table of the model's local models, one for all sets of demonstrations: no pair is solved again.
+
+        What else is `compared`, labels and the relation, is the same in all calls.
+        """
         key = distance, anchored
         if key not in self._tables:
-            self._tables[key] = SimilarityTable(self.mdp, distance=distance, anchored=anchored)
+            self._tables[key] = SimilarityTable(self.mdp, distance=distance, anchored=anchored, **compared)
         return self._tables[key]
 
     @functools.cached_property
     def _tables(self) -> dict[tuple[int, bool], SimilarityTable]:
         return {}
+
+    def labels(self, source: str) -> np.ndarray:
+        """The labels that a user means: the model's `features` or `reward`, or a file.
+
+        Raises:
+          ValueError: if the model has none of these; naming the file if it cannot be read.
+        """
+        if source == "features":
+            if not self.mdp.num_features:
+                raise ValueError(f"--labels features: {self.name} has none")
+            return np.asarray(self.mdp.features)
+        if source == "reward":
+            if self.reward is None:
+                raise ValueError(f"--labels reward: {self.name} has none (array 'reward')")
+            return np.asarray(self.reward)
+        try:
+            array = np.load(source, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise FileError(f"--labels {source}: not features or reward, and no .npy file: {error}") from None
+        if not isinstance(array, np.ndarray):
+            raise FileError(f"--labels {source}: must be an .npy file of a single array")
+        return array
 
     @property
     def events(self) -> dict[str, Any]:

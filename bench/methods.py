@@ -40,18 +40,19 @@ def expert(problem: Problem) -> Learned:
     return Learned(problem.expert.policy)
 
 
-def soft(problem: Problem, *, anchored: bool = True, mutual: bool = False) -> Learned:
-    """Algorithm 1, with the setting's distance and threshold."""
+def soft(problem: Problem, **options) -> Learned:
+    """Algorithm 1, with the setting's distance and threshold unless `options` say otherwise."""
     setting = problem.setting
-    options = {"distance": setting.distance, "threshold": setting.threshold, "tolerance": _SIMILARITY_TOLERANCE}
-    options |= {"anchored": anchored, "mutual": mutual}
+    of_setting = {"distance": setting.distance, "threshold": setting.threshold, "tolerance": _SIMILARITY_TOLERANCE}
+    options = of_setting | options
+    kind = {name: options[name] for name in ("anchored", "relation", "labels") if name in options}
     if problem.domain.terminal is not None:
         options["states"] = ~problem.domain.terminal  # the finish line puts the car back, whatever the action
     found, excess = [], []
     for model, demonstrations in zip(problem.models, problem.demonstrations, strict=True):
-        table = _table(setting, model, anchored)
+        table = _table(setting, model, **kind)
         found.append(jaxhom.soft_local_homomorphism(model, demonstrations, table=table, **options))
-        excess.append(excess_of(table, setting.threshold))
+        excess.append(excess_of(table, options["threshold"]))
     return Learned(jnp.stack([one.policy for one in found]), np.array([one.status for one in found]), np.array(excess))
 
 
@@ -61,17 +62,18 @@ def excess_of(table: SimilarityTable, threshold: float) -> float:
     return float((upper[upper <= threshold + _SIMILARITY_TOLERANCE] - threshold).max(initial=0.0))
 
 
-def _table(setting: Setting, model: MDP, anchored: bool) -> SimilarityTable:
+def _table(setting: Setting, model: MDP, labels=None, **kind) -> SimilarityTable:
     """What is known of the model's local models: shared by all draws and thresholds, unless each has its own model."""
     if setting.samples:
-        return SimilarityTable(model, distance=setting.distance, anchored=anchored)
-    return _shared_table(setting.domain, setting.distance, anchored)
+        return SimilarityTable(model, distance=setting.distance, labels=labels, **kind)
+    return shared_table(setting.domain, setting.distance, labels is not None, **kind)
 
 
-@functools.lru_cache(maxsize=32)
-def _shared_table(domain: str, distance: int, anchored: bool) -> SimilarityTable:
-    mdp = build_domain(domain, 1 if domain.startswith("grid") else 0).bare
-    return SimilarityTable(mdp, distance=distance, anchored=anchored)
+@functools.lru_cache(maxsize=64)
+def shared_table(domain: str, distance: int, is_labelled: bool, **kind) -> SimilarityTable:
+    """A domain's table of similarities, with the labels of the domain or without."""
+    found = build_domain(domain, 1 if domain.startswith("grid") else 0)
+    return SimilarityTable(found.bare, distance=distance, labels=found.labels if is_labelled else None, **kind)
 
 
 def generalize(function: Callable) -> Method:
@@ -100,7 +102,7 @@ def apprentice(method: Method) -> Method:
         policy = problem.once(method).policy
         # `jaxhom.feature_expectations`, compiled once per domain and not once per number of features.
         expectations = jnp.einsum("bsa,sak->bk", jaxhom.occupancy(problem.domain.bare, policy), mdp.features)
-        return _of_solution(mdp, jaxhom.lpal(mdp, expectations, initial_policy=policy))
+        return of_solution(mdp, jaxhom.lpal(mdp, expectations, initial_policy=policy))
 
     return learn
 
@@ -111,7 +113,7 @@ def full_policy(problem: Problem) -> Learned:
         return apprentice(expert)(problem)
     mdp, policy = problem.domain.mdp, problem.expert.policy
     solution = jaxhom.lpal(mdp, jaxhom.feature_expectations(mdp, policy[:1]), initial_policy=policy[:1])
-    return _of_solution(mdp, jax.tree.map(lambda leaf: jnp.repeat(leaf, len(policy), axis=0), solution))
+    return of_solution(mdp, jax.tree.map(lambda leaf: jnp.repeat(leaf, len(policy), axis=0), solution))
 
 
 def monte_carlo(problem: Problem, *, per_step: bool = False) -> Learned:
@@ -126,10 +128,10 @@ def monte_carlo(problem: Problem, *, per_step: bool = False) -> Learned:
     if mdp.num_features > _MANY_FEATURES:
         all_time = 1.0 / (1.0 - float(mdp.discount))
         options = {"method": "interior_point", "tolerance": _MONTE_CARLO_SHARE * all_time / mdp.num_features}
-    return _of_solution(mdp, jaxhom.lpal(mdp, found / (problem.setting.length if per_step else 1), **options))
+    return of_solution(mdp, jaxhom.lpal(mdp, found / (problem.setting.length if per_step else 1), **options))
 
 
-def _of_solution(mdp, solution) -> Learned:
+def of_solution(mdp, solution) -> Learned:
     gap = jnp.maximum(solution.margin_bound - solution.margin, 0.0) * (1.0 - mdp.discount)
     return Learned(solution.policy, np.asarray(solution.status), np.asarray(gap))
 

@@ -10,14 +10,20 @@ import operator
 import pathlib
 import zlib
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
+from gymnasium.envs.toy_text.frozen_lake import generate_random_map
 
 import jaxhom
+from bench.road_graph import road_graph
 from bench.settings import Setting
 from jaxhom import MDP, Demonstrations, Plan
+from jaxhom.interop import from_gymnasium
 
+_FROZEN = 0.85  # of the cells of a lake
 _TRACKS = pathlib.Path(__file__).resolve().parent / "tracks"
 
 
@@ -30,6 +36,7 @@ class Domain:
         what needs no features is compiled once per domain.
       coordinates: [S, 2].
       weights: [K], true reward weights; None where each draw has its own.
+      labels: [S, A, L], what else is known of states and actions; None for nothing.
       terminal: bool [S], and off_road: [S, A]; None on grids.
     """
 
@@ -37,6 +44,7 @@ class Domain:
     bare: MDP
     coordinates: jax.Array
     weights: jax.Array | None = None
+    labels: np.ndarray | None = None
     terminal: jax.Array | None = None
     off_road: jax.Array | None = None
 
@@ -97,11 +105,47 @@ def build_domain(name: str, regions: int) -> Domain:
     if name.startswith("grid"):
         world = jaxhom.gridworld(int(name[4:]), num_regions=regions)
         return Domain(world.mdp, _without_features(world.mdp), world.coordinates)
+    if name.startswith("lake"):
+        return _lake(int(name[4:]))
+    if name == "road":
+        return _road()
     letter = name.removeprefix("track_")
     shipped = _TRACKS / f"{letter}.track"
     track = jaxhom.racetrack(shipped if shipped.exists() else letter)
-    parts = (track.coordinates, track.weights, track.terminal, track.off_road)
-    return Domain(track.mdp, _without_features(track.mdp), *parts)
+    parts = {"weights": track.weights, "terminal": track.terminal, "off_road": track.off_road}
+    return Domain(track.mdp, _without_features(track.mdp), track.coordinates, **parts)
+
+
+def _lake(size: int) -> Domain:
+    """A slippery lake by Gymnasium's generator of maps; reward is time in the goal, which absorbs as the holes do."""
+    board = generate_random_map(size=size, p=_FROZEN, seed=size)
+    environment = gymnasium.make("FrozenLake-v1", desc=board)
+    found = from_gymnasium(environment, discount=0.99)
+    goal = np.array([cell == "G" for row in board for cell in row], float)
+    mdp = found.mdp.replace(features=goal[:, None])
+    coordinates = np.stack(np.divmod(np.arange(size**2), size), axis=1)
+    return Domain(mdp, _without_features(mdp), jnp.asarray(coordinates), weights=jnp.ones(1))
+
+
+def _road(destination: int = 0) -> Domain:
+    """A road network with a destination that absorbs, in which time is rewarded: few links are better than short ones.
+
+    The label of an exit is by how much the way to the destination is longer after it than before, in widths of a block
+    and at most 1: what a map knows.
+    """
+    road = road_graph(18)
+    mdp, end, length = road.mdp, int(road.destinations[destination]), np.asarray(road.mdp.features)[:, 0, 0]
+    leads_to, allowed = np.asarray(mdp.next_state)[..., 0], np.asarray(mdp.allowed)
+    steps = scipy.sparse.coo_array((length[leads_to][allowed], (np.nonzero(allowed)[0], leads_to[allowed])))
+    way = scipy.sparse.csgraph.dijkstra(steps.tocsr().T, indices=end)  # from the end of each link
+    detour = np.where(allowed, np.minimum(length[leads_to] + way[leads_to] - way[:, None], 1.0), 0.0)
+    leads_to, allowed = leads_to.copy(), allowed.copy()
+    leads_to[end], allowed[end], detour[end] = end, True, 0.0
+    goal = (np.arange(len(leads_to)) == end).astype(float)
+    chance = allowed[..., None].astype(float)
+    mdp = MDP.from_successors(leads_to[..., None], chance, discount=0.99, allowed=allowed, features=goal[:, None])
+    parts = {"weights": jnp.ones(1), "labels": detour[..., None]}
+    return Domain(mdp, _without_features(mdp), jnp.asarray(road.coordinates), **parts)
 
 
 def _without_features(mdp: MDP) -> MDP:

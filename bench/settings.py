@@ -9,6 +9,8 @@ GRID_REGIONS = {16: (16, 64, 256), 24: (64, 144, 576), 32: (64, 256, 1024), 48: 
 """The rows of Table I."""
 TRACK_LENGTHS = {"track_a": (20, 30), "track_b": (40, 50), "track_corner": (10, 15)}
 """Steps of a demonstration and of a trial (section VI.B); the corner is a small track of ours (`tracks/`)."""
+OTHER_LENGTHS = {"lake8": (40, 100), "lake16": (80, 200), "road": (40, 60)}
+"""Steps of a demonstration and of a trial on frozen lakes and on a road network."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,7 +18,7 @@ class Setting:
     """A family of problems, of which draws are numbered.
 
     Attributes:
-      domain: "grid" and its size, or a key of `TRACK_LENGTHS`.
+      domain: "grid" and its size, or a key of `TRACK_LENGTHS` or `OTHER_LENGTHS`.
       regions: K of a gridworld, 0 on tracks.
       demonstrations: how many of the draw's trajectories the learner sees: the first ones, so that the demonstrations
         of one number are among those of a larger one.
@@ -61,6 +63,11 @@ def track(domain: str, demonstrations: int, pool: int, **options) -> Setting:
     return Setting(domain, 0, demonstrations, pool, *TRACK_LENGTHS[domain], **options)
 
 
+def other(domain: str, demonstrations: int, pool: int) -> Setting:
+    """A lake or the road network."""
+    return Setting(domain, 0, demonstrations, pool, *OTHER_LENGTHS[domain])
+
+
 def table1() -> list[Setting]:
     """The rows of Table I."""
     return [grid(size, regions) for size, all_regions in GRID_REGIONS.items() for regions in all_regions]
@@ -96,6 +103,24 @@ def enough_question() -> list[Setting]:
     grids = [grid(size, 64, count, 100) for size in GRID_LENGTHS for count in (1, 2, 3, 5, 10, 20, 50, 100)]
     tracks = [track(name, count, 500) for name in ("track_a", "track_b") for count in (2, 5, 10, 20, 50, 100, 200, 500)]
     return grids + tracks
+
+
+def relations_question() -> list[Setting]:
+    """Racetracks, grids and lakes on which relations are compared."""
+    tracks = [track(name, count, 30) for name in ("track_a", "track_corner") for count in (2, 5, 10)]
+    tracks += [track("track_b", count, 30) for count in (10, 30)]
+    grids = [grid(size, 64, count, 10) for size in (16, 24) for count in (2, 5, 10)]
+    return tracks + grids + [other(name, count, 10) for name in ("lake8", "lake16") for count in (2, 5, 10)]
+
+
+def roads_question() -> list[Setting]:
+    """A road network, on which labels say how much of a detour an exit is."""
+    return [other("road", count, 30) for count in (2, 5, 10, 30)]
+
+
+def transfer_question() -> list[Setting]:
+    """The second racetrack; what is demonstrated is the first one (`relations.across`)."""
+    return [track("track_b", count, 30) for count in (2, 5, 10, 30)]
 
 
 def normalisation_question() -> list[Setting]:

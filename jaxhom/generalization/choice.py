@@ -26,6 +26,7 @@ from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP, absorbing_states, uniform_policy
+from jaxhom.similarity.given_table import table_for
 from jaxhom.similarity.lax_pairs import MAX_ACTIONS
 from jaxhom.similarity.relations import RELATIONS
 from jaxhom.similarity.table import SimilarityTable
@@ -136,7 +137,8 @@ def choose_generalization(
     name = max(scores, key=scores.__getitem__)
     best = known[name]
     if isinstance(best, dict):
-        best = functools.partial(soft_local_homomorphism, **best, table=tables.of(best), progress=progress)
+        options = {**best, "table": tables.of(best), "progress": progress}
+        best = functools.partial(soft_local_homomorphism, **options)
     return Choice(best=best(mdp, demonstrations), name=name, scores=scores, standard_errors=errors)
 
 
@@ -158,7 +160,7 @@ def _checked(name: str, candidate: Any, shared: dict[str, Any]) -> dict[str, Any
     if not isinstance(candidate, Mapping):
         raise ValueError(f"candidates[{name!r}] must be a mapping of options or a function, got {candidate!r}")
     for option in candidate:
-        if option not in {*_OF_TABLE, *_OF_RULE, "states"}:
+        if option not in {*_OF_TABLE, *_OF_RULE, "states", "table"}:
             raise ValueError(f"candidates[{name!r}] has the option {option!r}, which soft_local_homomorphism lacks")
     options = {**shared, **candidate}
     try:
@@ -181,6 +183,8 @@ class _Tables:
     def of(self, options: dict[str, Any]) -> SimilarityTable:
         """The table of a candidate."""
         kind = {name: options[name] for name in _OF_TABLE if name in options}
+        if options.get("table") is not None:
+            return table_for(options["table"], self._mdp, **{"distance": 1, "anchored": True, **kind})
         key = tuple((name, id(value) if name in ("labels", "relation") else value) for name, value in kind.items())
         if key not in self._known:
             self._known[key] = SimilarityTable(self._mdp, **kind)

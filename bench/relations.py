@@ -1,0 +1,136 @@
+"""Methods that compare relations between local models, voters, weights and labels, and the choice among them.
+
+Names are those of `default_candidates`: a relation and its threshold, and what else differs from Algorithm 1. With
+labels they end in "labels". `ACROSS` learns on a racetrack from demonstrations on another.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxhom
+from bench.methods import Learned, Method, expert, manhattan_knn, maximum_entropy, of_solution, shared_table, soft
+from bench.problems import Problem, build_domain, draw_problem
+from bench.settings import track
+from jaxhom.generalization.choice import default_candidates
+
+_POOL = 30  # trajectories that are drawn on the first track
+_LABELS = " labels"
+
+_RELATIONS: dict[str, dict[str, Any]] = {
+    f"{relation} {threshold:g}": {"relation": relation, "threshold": threshold}
+    for relation in jaxhom.similarity.relations.RELATIONS
+    for threshold in ((0.0,) if relation == "isomorphic" else (0.0, 0.1, 0.2))
+}
+_VOTERS: dict[str, dict[str, Any]] = {
+    "homomorphism 0, 3 voters": {"voters": 3},
+    "homomorphism 0, all": {"voters": "all"},
+    "isomorphic 0, all": {"relation": "isomorphic", "voters": "all"},
+    "lax 0, all": {"relation": "lax", "voters": "all"},
+    "homomorphism 0.2, weighted": {"threshold": 0.2, "weights": "similarity"},
+    "homomorphism 0.5, all, weighted": {"threshold": 0.5, "voters": "all", "weights": "similarity"},
+}
+
+
+def related(problem: Problem, *, is_labelled: bool = False, **options) -> Learned:
+    """Algorithm 1 with other options, and with the labels of the domain."""
+    return soft(problem, **options, **({"labels": problem.domain.labels} if is_labelled else {}))
+
+
+def chosen(problem: Problem, *, is_labelled: bool = False) -> Learned:
+    """The choice among the default candidates, and with labels those that have them too; tables are shared by draws."""
+    domain, setting = problem.domain, problem.setting
+    candidates = _with_tables(setting.domain, default_candidates(domain.bare), is_labelled)
+    states = None if domain.terminal is None else ~np.asarray(domain.terminal)
+    pairs = zip(problem.models, problem.demonstrations, strict=True)
+    found = [jaxhom.choose_generalization(*pair, candidates, states=states).best for pair in pairs]
+    status = [0 if one.status is None else int(one.status) for one in found]
+    return Learned(jnp.stack([one.policy for one in found]), np.array(status))
+
+
+def _with_tables(domain: str, candidates: Mapping[str, Any], is_labelled: bool) -> dict[str, Any]:
+    result = dict(candidates)
+    for with_labels in (False, True)[: 1 + is_labelled]:
+        labels = build_domain(domain, 1 if domain.startswith("grid") else 0).labels if with_labels else None
+        others = _VOTERS if with_labels else {}
+        for name, one in ({**candidates, **others}).items():
+            if isinstance(one, Mapping):
+                table = shared_table(domain, 1, with_labels, relation=one.get("relation", "homomorphism"))
+                result[name + _LABELS * with_labels] = {**one, "labels": labels, "table": table}
+    return result
+
+
+def smallest_label(problem: Problem) -> Learned:
+    """The control of labels: in every state, demonstrated or not, the exit with the smallest label."""
+    label = np.where(problem.domain.mdp.allowed, problem.domain.labels[..., 0], np.inf)
+    policy = np.eye(label.shape[1])[label.argmin(axis=1)]
+    return Learned(jnp.broadcast_to(policy, (len(problem.draws), *policy.shape)))
+
+
+def across(problem: Problem, *, method: str = "votes", **options) -> Learned:
+    """Learns track (b) from demonstrations on track (a): all that are similar vote, wherever they are."""
+    source = track("track_a", problem.setting.demonstrations, _POOL)
+    shown = draw_problem(source, problem.draws, 0).demonstrations
+    union, table = _union(options.get("relation", "homomorphism"))
+    here = union.states(1)
+    states = np.zeros(union.mdp.num_states, bool)
+    states[here] = ~np.asarray(problem.domain.terminal)
+    policies, status = [], []
+    for demonstrations in shown:
+        placed = union.place(0, demonstrations)
+        if method == "k-NN":
+            found = jaxhom.nearest_neighbors(union.mdp, placed)
+        else:
+            kind = {"table": table, "states": states, "voters": "all"}
+            found = jaxhom.soft_local_homomorphism(union.mdp, placed, **kind, **options)
+        policies.append(found.policy[here])
+        status.append(int(found.status))
+    return Learned(jnp.stack(policies), np.array(status))
+
+
+@functools.lru_cache(maxsize=8)
+def _union(relation: str) -> tuple[Any, jaxhom.SimilarityTable]:
+    tracks = [build_domain(name, 0).bare for name in ("track_a", "track_b")]
+    union = jaxhom.disjoint_union(tracks)
+    return union, jaxhom.SimilarityTable(union, relation=relation)
+
+
+def nothing_fed(problem: Problem) -> Learned:
+    """The control of LPAL: fed with zeros."""
+    mdp = problem.domain.mdp
+    solution = jaxhom.lpal(mdp, jnp.zeros((1, mdp.num_features)))
+    return of_solution(mdp, jax.tree.map(lambda leaf: jnp.repeat(leaf, len(problem.draws), axis=0), solution))
+
+
+def _methods(chosen_ones: Mapping[str, Mapping[str, Any]], **more) -> dict[str, Method]:
+    suffix = _LABELS if more.get("is_labelled") else ""
+    return {name + suffix: functools.partial(related, **options, **more) for name, options in chosen_ones.items()}
+
+
+_CONTROLS: dict[str, Method] = {"expert": expert, "uniform": maximum_entropy, "k-NN": manhattan_knn}
+WITHOUT_LABELS: dict[str, Method] = {**_CONTROLS, **_methods(_RELATIONS), **_methods(_VOTERS), "chosen": chosen}
+"""On models without labels."""
+WITH_LABELS: dict[str, Method] = {
+    **_CONTROLS,
+    "smallest label": smallest_label,
+    **_methods(_RELATIONS),
+    **_methods(_VOTERS),
+    **_methods(_RELATIONS, is_labelled=True),
+    **_methods(_VOTERS, is_labelled=True),
+    "chosen": functools.partial(chosen, is_labelled=True),
+}
+"""On models with labels, with and without them."""
+ACROSS: dict[str, Method] = {
+    "expert": expert,
+    "uniform": lambda problem: Learned(jnp.full_like(problem.expert.policy, 1.0 / problem.expert.policy.shape[-1])),
+    "k-NN": functools.partial(across, method="k-NN"),
+    "LPAL fed with zeros": nothing_fed,
+    **{name: functools.partial(across, **options) for name, options in _RELATIONS.items()},
+}
+"""From one model to another."""

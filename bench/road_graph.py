@@ -126,7 +126,8 @@ def _exits(places: np.ndarray, links: np.ndarray) -> np.ndarray:
 def _strongly_connected(links: np.ndarray, leads_to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The largest part in which all links lead to one another, renumbered; exits that leave it are closed."""
     begin, exit_ = np.nonzero(leads_to >= 0)
-    graph = scipy.sparse.coo_array((np.ones(len(begin), bool), (begin, leads_to[begin, exit_])), shape=(len(links),) * 2)
+    index, shape = (begin, leads_to[begin, exit_]), (len(links),) * 2
+    graph = scipy.sparse.coo_array((np.ones(len(begin), bool), index), shape=shape)
     _, part = scipy.sparse.csgraph.connected_components(graph.tocsr(), connection="strong")
     kept = part == np.bincount(part).argmax()
     number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)

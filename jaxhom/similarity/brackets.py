@@ -2,7 +2,8 @@
 
 PDHG decides quickly on which side of a threshold an error lies and takes models of any size; the interior-point method
 needs about ten steps to any tolerance, each with a factorisation of the size of the map. `choose_method` is the one
-place that chooses.
+place that chooses. Decisions of which bounds without iterations (`free_bounds`) or intervals (`propagation`) can be
+sure need neither.
 
 Bounds are widened by the rounding of the sums behind them, which is known beforehand. Where it would take up much of
 the tolerance, as in float32 it does from about ten states on, PDHG runs until its bounds are as close as asked for but
@@ -23,6 +24,7 @@ from jaxhom.similarity.free_bounds import lower_bounds_without_iterations, upper
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import certified_bounds
 from jaxhom.similarity.host_interior_point import seconds_on_host, solve_on_host
+from jaxhom.similarity.propagation import bounds_by_intervals
 from jaxhom.solvers import pdhg
 from jaxhom.solvers.lane_queue import is_settled, solve_many
 from jaxhom.status import Record, Status
@@ -50,7 +52,7 @@ class LocalSimilarity(Record):
     Attributes:
       lower: [P], lower <= e <= upper for the optimal error e, rounding included.
       upper: [P], likewise.
-      iterations: int32 [P], iterations of the method that settled the pair; 0 where the local models are isomorphic.
+      iterations: int32 [P], iterations of the method that settled the pair; 0 where none was needed.
       status: int32 [P], a `jaxhom.Status`.
     """
 
@@ -153,9 +155,17 @@ def bracket_errors(
     for start in range(0, len(waiting), _CHUNK_PAIRS):
         chunk = waiting[start : start + _CHUNK_PAIRS]
         problem = _problem(chunk, source, target, source_size, target_size, labels, anchored)
-        found = _solve(problem, goal, progress)
-        for name in ("lower", "upper", "iterations", "status"):
-            getattr(result, name)[chunk] = getattr(found, name)
+        if goal.decides and goal.method == "auto":
+            lower, upper = bounds_by_intervals(problem, goal.threshold, goal.tolerance)
+            result.lower[chunk] = np.maximum(result.lower[chunk], lower)
+            result.upper[chunk] = np.minimum(result.upper[chunk], upper)
+            is_open = ~goal.is_met(lower, upper)
+            progress(int((~is_open).sum()))
+            chunk, problem = chunk[is_open], jax.tree.map(lambda leaf, kept=is_open: leaf[..., kept], problem)
+        if chunk.size:
+            found = _solve(problem, goal, progress)
+            for name in ("lower", "upper", "iterations", "status"):
+                getattr(result, name)[chunk] = getattr(found, name)
     return result
 
 

@@ -12,14 +12,11 @@ from tqdm import tqdm
 
 from jaxhom.similarity.brackets import Goal, LocalSimilarity, bracket_errors, find_maps
 from jaxhom.similarity.classes import ClassBook, model_rounding
-from jaxhom.similarity.free_bounds import Profile, lower_bounds, rounded_down
 from jaxhom.similarity.local_models import LocalModelMaker, LocalModels, is_oversized
 from jaxhom.status import Status
 
 _SMALL = 8  # local models up to this size share one padding
 _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
-_PROFILE_ENTRIES = 2**22  # of pairs of profiles that are compared at a time
-_MODEL_ENTRIES = 2**22  # of local models whose profiles are made at a time, about
 _CHUNK_BYTES = 256 * 2**20  # of local models that are built at a time
 _MAX_PRODUCTS = 2e11  # multiplications per pair, a minute or two: large models stop with the bounds that they have
 _MAX_MAP_PRODUCTS = 2e10  # the same for a map, which somebody waits for
@@ -40,17 +37,12 @@ class ClassPairs:
         self._maker, self._book, self._anchored = maker, book, anchored
         self.dtype, self._num_actions = maker.graph.dtype, maker.graph.num_actions
         self.num_solved = 0
-        self._profiles: Profile | None = None  # of all classes; those of classes that were not asked for are not known
-        self._is_profiled = np.zeros(0, bool)
 
     def brackets(self, pairs: np.ndarray, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
         """Bounds for different ordered pairs of classes [Q, 2]; a class against itself has an isomorphism."""
         groups = _Groups(pairs, self._book.size, self._num_actions)
         result = self._without_programs(groups)
-        if goal.decides and self._anchored:
-            (asked,) = np.nonzero(groups.to_solve)
-            result.lower[asked] = self._lower_bounds(pairs[asked])
-            groups.leave_out(result.lower > goal.threshold)
+        self.num_solved += int(groups.to_solve.sum())
         with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
             bar.update(int((~groups.to_solve).sum()))
             for members, widths in groups.members():
@@ -61,7 +53,6 @@ class ClassPairs:
                     limited = self._limited(goal, widths, _MAX_PRODUCTS)
                     found = bracket_errors(**models, goal=limited, progress=bar.update)
                     jax.tree.map(lambda place, new, index=index: np.put(place, index, new), result, found)
-        self.num_solved += int((result.iterations > 0).sum())
         return result
 
     def map_of(self, pair: np.ndarray, goal: Goal) -> tuple[LocalSimilarity, np.ndarray]:
@@ -91,34 +82,6 @@ class ClassPairs:
         the models that stand for their classes, they are not (in float32 it alone may exceed the tolerance).
         """
         return goal.tolerance if goal.decides else np.maximum(goal.tolerance - 2.0 * slack, 0.5 * goal.tolerance)
-
-    def _lower_bounds(self, pairs: np.ndarray) -> np.ndarray:
-        """What the profiles of classes say of the errors of pairs [Q, 2]."""
-        self._profile(np.unique(pairs))
-        bounds = np.zeros(len(pairs), self.dtype)
-        if self._profiles is not None:
-            chunk = max(1, _PROFILE_ENTRIES // self._profiles.num_entries)
-            for start in range(0, len(pairs), chunk):
-                part = slice(start, start + chunk)
-                sides = (self._profiles.of_models(classes) for classes in pairs[part].T)
-                bounds[part] = rounded_down(lower_bounds(*sides), self.dtype)
-        return bounds
-
-    def _profile(self, classes: np.ndarray) -> None:
-        """Makes the profiles of those of the given classes that have none, from models of about their sizes."""
-        known = np.zeros(len(self._book), bool)
-        known[: len(self._is_profiled)] = self._is_profiled
-        size = self._book.size
-        fresh = classes[~known[classes]]
-        fresh = fresh[np.argsort(size[fresh], kind="stable")]
-        entries = np.cumsum(size[fresh].astype(np.int64) ** 2 * self._num_actions)
-        for part in np.split(fresh, np.flatnonzero(np.diff(entries // _MODEL_ENTRIES)) + 1):
-            if part.size:
-                models = self._models(part, int(size[part].max()))
-                found = Profile.of(models.transition, models.labels)
-                self._profiles = found.placed(part, len(self._book), self._profiles)
-        known[fresh] = True
-        self._is_profiled = known
 
     def _limited(self, goal: Goal, widths: tuple[int, int], products: float) -> Goal:
         """The goal for models of so many states, with no more iterations than so many multiplications allow."""
@@ -180,12 +143,8 @@ class _Groups:
         self.of_pair = np.where(pairs[:, :1] == pairs[:, 1:], _SAME, groups)
         self.to_solve = self.of_pair[:, 0] >= 0
 
-    def leave_out(self, is_settled: np.ndarray) -> None:
-        """Takes pairs, bool [Q], for solved."""
-        self.to_solve &= ~is_settled
-
     def members(self):
         """Numbers of the pairs of each padding, and its widths (n, m)."""
         for group in np.unique(self.of_pair[self.to_solve], axis=0):
-            (index,) = np.nonzero(self.to_solve & (self.of_pair == group).all(axis=1))
+            (index,) = np.nonzero((self.of_pair == group).all(axis=1))
             yield index, tuple(int(self._size[self._of_class <= side].max()) for side in group)

@@ -28,6 +28,7 @@ from jaxhom.models.demonstrations import (
     monte_carlo_feature_expectations,
     sample_demonstrations,
 )
+from jaxhom.models.disjoint_union import DisjointUnion, disjoint_union
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
 from jaxhom.models.mdp import MDP
 from jaxhom.models.stacking import stack_models
@@ -47,6 +48,7 @@ __all__ = [
     "LPAL",
     "MDP",
     "Demonstrations",
+    "DisjointUnion",
     "Evaluation",
     "Explanation",
     "Generalization",
@@ -61,6 +63,7 @@ __all__ = [
     "Status",
     "TileMap",
     "agreement",
+    "disjoint_union",
     "empirical_policy",
     "evaluate_by_sampling",
     "evaluate_exactly",

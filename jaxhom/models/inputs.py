@@ -145,3 +145,49 @@ def check_reward_values(
         xp = checks.arrays_of(mdp.allowed, reward)
         reward = xp.where(xp.asarray(mdp.allowed), reward, forbidden)
     return reward
+
+
+def check_labels(
+    mdp: MDP,
+    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | Num[ArrayLike, "S A"],
+    label_weight: Num[ArrayLike, ""] = 1.0,
+    name: str = "labels",
+) -> Float[Array | np.ndarray, "S A L"]:
+    """Labels that maps between states have to keep, for every pair, in the model's type; times their weight.
+
+    In NumPy where they are concrete. Where an action is not allowed they count as given, and as 0 where not finite.
+
+    Args:
+      mdp: the model.
+      labels: [S, A, L], or [S, L] for labels of the state, which count for every action. [S, A], a reward say, is one
+        label of every action.
+      label_weight: scalar, not negative.
+      name: what to call the labels in messages.
+
+    Raises:
+      ValueError: if a shape does not fit; where values are concrete also if the weight is negative, or naming the first
+        entry that is not finite where its action is allowed, or is too large for the model's type.
+    """
+    states, actions = mdp.num_states, mdp.num_actions
+    is_traced = checks.is_traced(labels, mdp.allowed)
+    xp = jnp if is_traced else np
+    labels = jnp.asarray(labels, mdp.dtype) if is_traced else checks.as_host_array(name, labels)
+    by_state = labels.ndim == 2 and labels.shape[0] == states and labels.shape != (states, actions)
+    if labels.shape == (states, actions):
+        labels = labels[..., None]
+    by_pair = labels.ndim == 3 and labels.shape[:2] == (states, actions)
+    checks.require_shape(name, labels, f"({states}, {actions}, L) or ({states}, L)", by_state or by_pair)
+    checks.require_shape("label_weight", label_weight, "()", np.ndim(label_weight) == 0)
+    checks.require_positive("label_weight", label_weight, or_zero=True)
+    if by_pair and mdp.restricts_actions and labels.dtype.kind == "f":
+        labels = xp.where(xp.asarray(mdp.allowed)[..., None] | xp.isfinite(labels), labels, 0)
+    if not is_traced:
+        labels = checks.require_floats_in(mdp.dtype, name, labels)
+    if is_traced or checks.is_traced(label_weight):
+        labels = jnp.asarray(labels, mdp.dtype) * jnp.asarray(label_weight, mdp.dtype)
+    else:
+        with np.errstate(over="ignore"):
+            weighted = labels * np.asarray(label_weight, mdp.dtype)
+        labels = checks.require_floats_in(mdp.dtype, f"label_weight * {name}", weighted)
+    xp = np if isinstance(labels, np.ndarray) else jnp
+    return labels if by_pair else xp.broadcast_to(labels[:, None], (states, actions, labels.shape[-1]))

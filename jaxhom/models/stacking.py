@@ -7,7 +7,7 @@ made anew in the sizes of the largest; the transitions stay what they are.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -56,16 +56,20 @@ def stack_models(models: Iterable[MDP]) -> MDP:
       >>> [round(float(v), 3) for v in value]
       [4.305, 2.744, 1.164]
     """
-    stacked = _as_models(models)
-    if not stacked:
-        raise ValueError("models is empty: a stack needs one at least")
-    _require_alike(stacked)
+    stacked = as_models(models, "a stack")
+    require_alike(stacked, _traits)
     restricts = any(model.restricts_actions for model in stacked)
     stacked = [dataclasses.replace(model, restricts_actions=restricts) for model in _in_common_sizes(stacked)]
     return jax.tree.map(_stack, *stacked)
 
 
-def _as_models(models: Any) -> list[MDP]:
+def as_models(models: Any, what: str) -> list[MDP]:
+    """Several models, each as it is or as what has one as `.mdp`.
+
+    Raises:
+      ValueError: if they are not several, or none, of which `what` ("a stack") cannot be made; naming the first that is
+        no model.
+    """
     if isinstance(models, Record) or not isinstance(models, Iterable):
         raise ValueError(f"models must be several, in a list for one, got {type(models).__name__}")
     found = []
@@ -74,14 +78,16 @@ def _as_models(models: Any) -> list[MDP]:
             found.append(as_model(model))
         except ValueError as error:
             raise ValueError(f"models[{number}]: {error}") from None
+    if not found:
+        raise ValueError(f"models is empty: {what} needs one at least")
     return found
 
 
-def _require_alike(models: list[MDP]) -> None:
-    """Raises unless every model is like the first one."""
-    first = _traits(models[0])
+def require_alike(models: list[MDP], traits: Callable[[MDP], dict[str, Any]]) -> None:
+    """Raises unless every model has the traits of the first one, naming the first that does not."""
+    first = traits(models[0])
     for number, model in enumerate(models):
-        for name, trait in _traits(model).items():
+        for name, trait in traits(model).items():
             if trait != first[name]:
                 raise ValueError(f"models[{number}] has {name} {trait}, models[0] has {first[name]}")
 

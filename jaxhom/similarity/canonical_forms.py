@@ -25,14 +25,9 @@ def canonical_forms(
     Returns:
       P keys, and the order of the states that each is read off in, int [P, n], centre first.
     """
-    quanta = np.rint(transition.astype(np.float64) * 2.0**bits).astype(np.uint64)
+    quanta, marks = _quantised(transition, labels, bits)
     count, size = quanta.shape[:2]
-    colour = np.broadcast_to(np.where(np.arange(size) == 0, 1, 2).astype(np.uint64), (count, size))
-    if labels is not None:
-        marks = np.rint(labels.astype(np.float64) * 2.0**bits).astype(np.int64).view(np.uint64).reshape(count, size, -1)
-        place = np.arange(marks.shape[2], dtype=np.uint64)
-        colour = _mix(colour + _mix(_mix(marks) + place).sum(axis=2))
-    colour = _refine(quanta, colour)
+    colour = _refine(quanta, _first_colours(quanta, marks))
     active = np.arange(count)
     while True:
         tied = _tied(colour[active])
@@ -50,24 +45,73 @@ def canonical_forms(
     return keys, order
 
 
+def colours_in_rounds(
+    transition: np.ndarray, bits: int, labels: np.ndarray | None, num_rounds: int, is_anchored: bool
+) -> np.ndarray:
+    """Colours of every state before and after each round of refinement, uint64 [R + 1, P, n].
+
+    Equal colours, in any two models, stand for equal surroundings up to as many steps as there were rounds.
+
+    Args:
+      transition, bits, labels: as in `canonical_forms`.
+      num_rounds: R.
+      is_anchored: whether the centre has a colour of its own from the start.
+    """
+    quanta, marks = _quantised(transition, labels, bits)
+    present, edge = _edges(quanta)
+    colours = [_first_colours(quanta, marks, is_anchored)]
+    for _ in range(num_rounds):
+        colours.append(_refined(edge, present, colours[-1]))
+    return np.stack(colours)
+
+
+def _quantised(transition, labels, bits: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Probabilities [P, n, A, n] and labels [P, n, A L] as whole numbers of quanta."""
+    quanta = np.rint(transition.astype(np.float64) * 2.0**bits).astype(np.uint64)
+    if labels is None:
+        return quanta, None
+    marks = np.rint(labels.astype(np.float64) * 2.0**bits).astype(np.int64).view(np.uint64)
+    return quanta, marks.reshape(*quanta.shape[:2], -1)
+
+
+def _first_colours(quanta: np.ndarray, marks: np.ndarray | None, is_anchored: bool = True) -> np.ndarray:
+    """Colours [P, n] of the labels, and of being the centre."""
+    count, size = quanta.shape[:2]
+    own = np.where(is_anchored & (np.arange(size) == 0), 1, 2).astype(np.uint64)
+    colour = np.broadcast_to(own, (count, size))
+    if marks is None:
+        return colour
+    place = np.arange(marks.shape[2], dtype=np.uint64)
+    return _mix(colour + _mix(_mix(marks) + place).sum(axis=2))
+
+
 def _refine(quanta: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """Colour refinement to a stable partition; colours are [P, n] hashes that do not depend on the order.
 
     A model stops when its own partition is stable: its colours must not depend on the models beside it.
     """
-    action = np.arange(quanta.shape[2], dtype=np.uint64)[:, None]
-    present = quanta > 0
-    edge = _mix(quanta * np.uint64(31) + action)
+    present, edge = _edges(quanta)
     colour, active = colour.copy(), np.arange(len(colour))
     while active.size:
         old = colour[active]
-        leads_to = np.where(present, _mix(edge + old[:, None, None, :]), np.uint64(0))
-        led_to_by = np.where(present, _mix(edge ^ _mix(old)[:, :, None, None]), np.uint64(0))
-        outgoing, incoming = leads_to.sum(axis=(2, 3)), led_to_by.sum(axis=(1, 2))
-        colour[active] = _mix(old + _mix(outgoing) + _mix(_mix(incoming)))
+        colour[active] = _refined(edge, present, old)
         refines = _num_colours(colour[active]) != _num_colours(old)
         active, edge, present = active[refines], edge[refines], present[refines]
     return colour
+
+
+def _edges(quanta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where there is a transition, and the hash of its probability and its action, [P, n, A, n]."""
+    action = np.arange(quanta.shape[2], dtype=np.uint64)[:, None]
+    return quanta > 0, _mix(quanta * np.uint64(31) + action)
+
+
+def _refined(edge: np.ndarray, present: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """Colours [P, n] after one round."""
+    leads_to = np.where(present, _mix(edge + colour[:, None, None, :]), np.uint64(0))
+    led_to_by = np.where(present, _mix(edge ^ _mix(colour)[:, :, None, None]), np.uint64(0))
+    outgoing, incoming = leads_to.sum(axis=(2, 3)), led_to_by.sum(axis=(1, 2))
+    return _mix(colour + _mix(outgoing) + _mix(_mix(incoming)))
 
 
 def _num_colours(colour: np.ndarray) -> np.ndarray:

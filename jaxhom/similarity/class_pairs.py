@@ -1,10 +1,12 @@
 """LP (9) for pairs of classes of local models: padded to a few sizes, so that few programs are compiled.
 
 What is found is about the local model that stands for its class. Models of one class differ by up to `model_rounding`
-in every probability, and `class_slack` says by how much errors may.
+in every probability, and in every label by that share of the largest; `ClassPairs.slack` says by how much errors may.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -13,7 +15,7 @@ from tqdm import tqdm
 from jaxhom.similarity.brackets import Goal, LocalSimilarity, bracket_errors, find_maps
 from jaxhom.similarity.classes import ClassBook, model_rounding
 from jaxhom.similarity.local_models import LocalModelMaker, LocalModels, is_oversized
-from jaxhom.status import Status
+from jaxhom.status import Record, Status
 
 _SMALL = 8  # local models up to this size share one padding
 _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike
@@ -24,31 +26,96 @@ _MIN_ITERATIONS = 64  # however large
 _SAME, _TOO_LARGE = -1, -2  # in place of a size group
 
 
+class LocalModel(Record):
+    """The local model that stands for a class, as relations of the user's get it; NumPy.
+
+    Attributes:
+      states: int [n], the states of the model, centre first, then ascending.
+      transition: [n, A, n], T^{s,d}; zero where an action is not allowed.
+      labels: [n, A, L], what else tells states and actions apart, and last, where some state of the model lacks some
+        action, 1 where an action is not allowed; None where there is neither.
+    """
+
+    states: Int[np.ndarray, " n"]
+    transition: Float[np.ndarray, "n A n"]
+    labels: Float[np.ndarray, "n A L"] | None = None
+
+
+class ClassModels:
+    """The local models that stand for classes.
+
+    Args:
+      maker: builds local models.
+      book: the classes.
+
+    Attributes:
+      dtype, num_actions: of the model.
+      label_size: as in `LocalModelMaker`.
+      has_labels: whether there are labels.
+    """
+
+    def __init__(self, maker: LocalModelMaker, book: ClassBook):
+        self._maker, self._book = maker, book
+        self.dtype, self.num_actions = maker.graph.dtype, maker.graph.num_actions
+        self.label_size, self.has_labels = maker.label_size, maker.labels is not None
+
+    @property
+    def size(self) -> np.ndarray:
+        """int32 [C]: how many states they have."""
+        return self._book.size
+
+    def of(self, classes: np.ndarray, width: int) -> LocalModels:
+        """The models of classes [Q], padded to a width; each is built once."""
+        different, position = np.unique(classes, return_inverse=True)
+        models = self._maker.make(self._book.representative[different], width)
+        return jax.tree.map(lambda leaf: leaf[position], models)
+
+    def alone(self, number: int, most: float | None = None) -> LocalModel:
+        """The model of one class, not padded; with labels of at most so much, if `most` is given."""
+        found = self.of(np.array([number]), int(self.size[number]))
+        labels = None if found.labels is None else found.labels[0] * (most / self.label_size if most else 1.0)
+        return LocalModel(states=found.members[0], transition=found.transition[0], labels=labels)
+
+    def of_pairs(self, pairs: np.ndarray) -> Iterator[tuple[np.ndarray, LocalModels, LocalModels]]:
+        """Numbers of different pairs of classes [Q, 2] of a few sizes, and their models; none that are too large."""
+        groups = _Groups(pairs, self)
+        groups.of_pair = np.where(groups.of_pair == _SAME, groups.of_class[pairs], groups.of_pair)
+        for members, widths in groups.members():
+            for index in self.chunks(members, widths):
+                yield index, *(self.of(classes, width) for classes, width in zip(pairs[index].T, widths, strict=True))
+
+    def chunks(self, members: np.ndarray, widths: tuple[int, int]) -> list[np.ndarray]:
+        """Numbers of pairs of models of so many states, as many at a time as memory allows."""
+        size = max(widths) ** 2 * self.num_actions * np.dtype(self.dtype).itemsize
+        chunk = max(1, _CHUNK_BYTES // size)
+        return np.split(members, range(chunk, len(members), chunk))
+
+
 class ClassPairs:
     """Solves LP (9) between classes.
 
     Args:
-      maker: builds their local models.
-      book: the classes.
+      models: those that stand for the classes.
       anchored: require that the centre is mapped to the centre.
     """
 
-    def __init__(self, maker: LocalModelMaker, book: ClassBook, anchored: bool):
-        self._maker, self._book, self._anchored = maker, book, anchored
-        self.dtype, self._num_actions = maker.graph.dtype, maker.graph.num_actions
+    has_maps = True
+
+    def __init__(self, models: ClassModels, anchored: bool):
+        self._models, self._anchored = models, anchored
+        self.dtype, self._num_actions = models.dtype, models.num_actions
         self.num_solved = 0
+        self.most = 2.0 * models.label_size if models.has_labels else 1.0  # that any map can be off by
 
     def brackets(self, pairs: np.ndarray, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
         """Bounds for different ordered pairs of classes [Q, 2]; a class against itself has an isomorphism."""
-        groups = _Groups(pairs, self._book.size, self._num_actions)
+        groups = _Groups(pairs, self._models)
         result = self._without_programs(groups)
         self.num_solved += int(groups.to_solve.sum())
         with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
             bar.update(int((~groups.to_solve).sum()))
             for members, widths in groups.members():
-                size = max(widths) ** 2 * self._num_actions * np.dtype(self.dtype).itemsize
-                chunk = max(1, _CHUNK_BYTES // size)
-                for index in np.split(members, range(chunk, len(members), chunk)):
+                for index in self._models.chunks(members, widths):
                     models = self._pair(pairs[index], widths)
                     limited = self._limited(goal, widths, _MAX_PRODUCTS)
                     found = bracket_errors(**models, goal=limited, progress=bar.update)
@@ -57,8 +124,8 @@ class ClassPairs:
 
     def map_of(self, pair: np.ndarray, goal: Goal) -> tuple[LocalSimilarity, np.ndarray]:
         """Bounds [1] for one pair of classes, and a map [n, m] whose own error is at most the upper one."""
-        groups = _Groups(pair[None], self._book.size, self._num_actions)
-        n, m = self._book.size[pair]
+        groups = _Groups(pair[None], self._models)
+        n, m = self._models.size[pair]
         if not groups.to_solve[0]:  # the identity; or, where models are too large, everything to the centre
             f = np.eye(n, m, dtype=self.dtype) if groups.of_pair[0, 0] == _SAME else np.eye(1, m, dtype=self.dtype)
             return self._without_programs(groups), np.broadcast_to(f, (n, m))
@@ -72,10 +139,13 @@ class ClassPairs:
 
         Nothing where the classes are the same, or where a model is too large to have company in its class.
         """
-        sizes = self._book.size[pairs]
+        sizes = self._models.size[pairs]
         alone = (pairs[:, 0] == pairs[:, 1]) | is_oversized(sizes, self._num_actions).any(axis=1)
-        slack = np.where(alone, 0.0, model_rounding(self.dtype) * (2.0 + sizes.max(axis=1, initial=0)))
-        return slack.astype(self.dtype)
+        return np.where(alone, 0.0, self._slack_of(sizes.max(axis=1, initial=0))).astype(self.dtype)
+
+    def _slack_of(self, size):
+        """The slack of models of up to so many states: a row of T f or f T' sums as many, labels are two at a time."""
+        return model_rounding(self.dtype) * np.maximum(2.0 + size, 2.0 * self._models.label_size)
 
     def tolerance(self, goal: Goal, slack):
         """What bounds have to reach before they are widened by `slack` on both sides: for decisions, which are about
@@ -87,7 +157,7 @@ class ClassPairs:
         """The goal for models of so many states, with no more iterations than so many multiplications allow."""
         n, m = widths
         affordable = max(products / (2.0 * self._num_actions * n * m * (n + m)), _MIN_ITERATIONS)
-        slack = model_rounding(self.dtype) * (2.0 + max(widths))
+        slack = self._slack_of(max(widths))
         limit = int(min(goal.max_iterations, affordable))
         return goal._replace(tolerance=float(self.tolerance(goal, slack)), max_iterations=limit)
 
@@ -96,14 +166,16 @@ class ClassPairs:
         group, count = groups.of_pair[:, 0], len(groups.of_pair)
         return LocalSimilarity(
             lower=np.zeros(count, self.dtype),
-            upper=np.where(group == _SAME, model_rounding(self.dtype), 1.0).astype(self.dtype),
+            upper=np.where(group == _SAME, model_rounding(self.dtype) * self._models.label_size, self.most).astype(
+                self.dtype
+            ),
             iterations=np.zeros(count, np.int32),
             status=np.where(group == _TOO_LARGE, Status.ITERATION_LIMIT, Status.SOLVED).astype(np.int32),
         )
 
     def _pair(self, pairs: np.ndarray, widths: tuple[int, int]) -> dict:
         """The models of pairs [Q, 2], as arguments of `bracket_errors`."""
-        source, target = (self._models(classes, width) for classes, width in zip(pairs.T, widths, strict=True))
+        source, target = (self._models.of(classes, width) for classes, width in zip(pairs.T, widths, strict=True))
         return {
             "source": source.transition,
             "target": target.transition,
@@ -114,11 +186,9 @@ class ClassPairs:
             "anchored": self._anchored,
         }
 
-    def _models(self, classes: np.ndarray, width: int) -> LocalModels:
-        """The models of classes [Q], padded to a width; each is built once."""
-        different, position = np.unique(classes, return_inverse=True)
-        models = self._maker.make(self._book.representative[different], width)
-        return jax.tree.map(lambda leaf: leaf[position], models)
+    def renamings(self, pairs: np.ndarray) -> None:
+        """None: every action stands for itself."""
+        del pairs
 
 
 class _Groups:
@@ -128,23 +198,27 @@ class _Groups:
     is as wide as its largest class, of all that are known: one width for a model's grids of five states, say.
 
     Attributes:
+      of_class: int [C], the size group of every class.
       of_pair: int [Q, 2], the size groups; `_SAME` or `_TOO_LARGE` where there is nothing to solve.
-      to_solve: bool [Q], the others.
     """
 
-    def __init__(self, pairs: np.ndarray, size: np.ndarray, num_actions: int):
-        self._size = size
-        self._of_class = np.ceil(np.log2(np.maximum(size, _SMALL))).astype(int)
-        groups = self._of_class[pairs]
+    def __init__(self, pairs: np.ndarray, models: ClassModels):
+        self._size = size = models.size
+        self.of_class = np.ceil(np.log2(np.maximum(size, _SMALL))).astype(int)
+        groups = self.of_class[pairs]
         larger = groups.max(axis=1, keepdims=True)
         groups = np.where(larger <= _ALIKE_GROUP, larger, groups)
-        too_large = is_oversized(size, num_actions)[pairs].any(axis=1, keepdims=True)
+        too_large = is_oversized(size, models.num_actions)[pairs].any(axis=1, keepdims=True)
         groups = np.where(too_large, _TOO_LARGE, groups)
         self.of_pair = np.where(pairs[:, :1] == pairs[:, 1:], _SAME, groups)
-        self.to_solve = self.of_pair[:, 0] >= 0
+
+    @property
+    def to_solve(self) -> np.ndarray:
+        """bool [Q]: the pairs that are neither the same nor too large."""
+        return self.of_pair[:, 0] >= 0
 
     def members(self):
         """Numbers of the pairs of each padding, and its widths (n, m)."""
         for group in np.unique(self.of_pair[self.to_solve], axis=0):
             (index,) = np.nonzero((self.of_pair == group).all(axis=1))
-            yield index, tuple(int(self._size[self._of_class <= side].max()) for side in group)
+            yield index, tuple(int(self._size[self.of_class <= side].max()) for side in group)

@@ -84,7 +84,8 @@ class ClassBook:
                 keys = [b"state %d" % state for state in states[index]]
             else:
                 models = self._maker.make(states[index], size, members[index])
-                forms, _ = canonical_forms(models.transition, _quantum_bits(graph.dtype), models.labels)
+                labels = None if models.labels is None else models.labels / self._maker.label_size
+                forms, _ = canonical_forms(models.transition, quantum_bits(graph.dtype), labels)
                 keys = [hashlib.blake2b(form, digest_size=16).digest() for form in forms]
             for state, key in zip(states[index].tolist(), keys, strict=True):
                 number = self._class_of_key.setdefault(key, len(self))
@@ -118,8 +119,8 @@ def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelC
 
 
 def model_rounding(dtype) -> float:
-    """Largest difference between two probabilities that `local_model_classes` takes as equal."""
-    return 2.0 ** -_quantum_bits(dtype)
+    """Largest difference between two probabilities that count as equal; between labels, as a share of `label_size`."""
+    return 2.0 ** -quantum_bits(dtype)
 
 
 def isomorphism(one: np.ndarray, other: np.ndarray, labels=None) -> np.ndarray | None:
@@ -128,7 +129,7 @@ def isomorphism(one: np.ndarray, other: np.ndarray, labels=None) -> np.ndarray |
     Args:
       one: [n, A, n], centre first, no padding.
       other: [m, A, m], likewise.
-      labels: those of both, [n, A, L] and [m, A, L]; or None.
+      labels: those of both, [n, A, L] and [m, A, L], 1 at most; or None.
 
     Returns:
       int [n], or None where the canonical forms differ. Equal up to `model_rounding`, as within a class.
@@ -136,7 +137,7 @@ def isomorphism(one: np.ndarray, other: np.ndarray, labels=None) -> np.ndarray |
     if one.shape != other.shape:
         return None
     stacked = None if labels is None else np.stack(labels)
-    (key, other_key), order = canonical_forms(np.stack([one, other]), _quantum_bits(one.dtype), stacked)
+    (key, other_key), order = canonical_forms(np.stack([one, other]), quantum_bits(one.dtype), stacked)
     if key != other_key:
         return None
     renaming = np.empty(len(one), int)
@@ -153,5 +154,6 @@ def _chunks(sizes: np.ndarray, weights: np.ndarray, num_actions: int) -> Iterato
         yield from np.split(same, np.flatnonzero(np.diff(batch)) + 1)
 
 
-def _quantum_bits(dtype) -> int:
+def quantum_bits(dtype) -> int:
+    """Numbers of models are equal to what compares these if they agree to so many binary digits after the point."""
     return 40 if dtype == np.float64 else 20

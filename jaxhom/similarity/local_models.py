@@ -4,9 +4,9 @@ M^{s,d} is the model restricted to s^d, the states within d steps of s by any ac
 s^d becomes a self-loop on the state it leaves (Boularias and Chaib-draa 2010, section V). The centre s is state 0
 of its local model; the others follow in ascending order; padding has no transitions at all.
 
-Actions that some states lack lead to one more absorbing state, "refused", that all local models share, that is mapped
-to itself and to which nothing else is mapped. That is one label per action, 1 where it is not allowed, which a map has
-to keep (`homomorphism_lp`); the rows of such actions are zero.
+Models may carry labels of states and actions, which a map has to keep (`homomorphism_lp`). Actions that some states
+lack lead to one more absorbing state, "refused", that all local models share, that is mapped to itself and to which
+nothing else is mapped. That is one more label, 1 where an action is not allowed; the rows of such actions are zero.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ class LocalModels(Record):
       members: int32 [P, n], the states of each model, centre first, then ascending; -1 on padding.
       size: int32 [P], the number of states of each model.
       transition: float [P, n, A, n], T^{s,d}; zero where either state is padding, and where an action is not allowed.
-      labels: float [P, n, A, 1], 1 where an action is not allowed; None where every state has all actions.
+      labels: float [P, n, A, L], zero on padding: the labels that were given, and last, where some state lacks some
+        action, 1 where an action is not allowed. None where there are neither.
     """
 
     members: np.ndarray
@@ -108,10 +109,26 @@ def local_indices(graph: HostGraph, next_state: np.ndarray, is_open: np.ndarray,
 
 
 class LocalModelMaker:
-    """Builds local models of one distance, some at a time, padded to any width."""
+    """Builds local models of one distance, some at a time, padded to any width.
 
-    def __init__(self, graph: HostGraph, distance: int):
+    Args:
+      graph: of the model.
+      distance: d >= 1.
+      labels: [S, A, L], what a map has to keep besides transitions; None for nothing.
+
+    Attributes:
+      graph, distance: as given.
+      labels: [S, A, L], those that were given and the one of actions that are not allowed; None where neither is.
+      label_size: a power of two that no label exceeds, 1 at least.
+    """
+
+    def __init__(self, graph: HostGraph, distance: int, labels: np.ndarray | None = None):
         self.graph, self.distance = graph, distance
+        refused = None if graph.refused is None else graph.refused[..., None]
+        parts = [part.astype(graph.dtype) for part in (labels, refused) if part is not None and part.size]
+        self.labels = np.concatenate(parts, axis=2) if parts else None
+        largest = 0.0 if self.labels is None else float(np.abs(self.labels).max(initial=0.0))
+        self.label_size = 2.0 ** np.ceil(np.log2(max(largest, 1.0)))
 
     def members(self, states: np.ndarray) -> scipy.sparse.csr_array:
         """Boolean [P, S], sorted: the states of each model."""
@@ -119,7 +136,8 @@ class LocalModelMaker:
 
     def make(self, states: np.ndarray, width: int, members: scipy.sparse.csr_array | None = None) -> LocalModels:
         """M^{s,d} of the given states, none of them larger than `width`; `members` where they are known."""
-        return _restrict(self.graph, states, self.members(states) if members is None else members, width)
+        members = self.members(states) if members is None else members
+        return _restrict(self.graph, states, members, width, self.labels)
 
 
 def restricted_model(mdp: MDP, states) -> np.ndarray:
@@ -156,7 +174,7 @@ def validated_states(mdp: MDP, states, distance: int) -> np.ndarray:
     return check_states(mdp, states)
 
 
-def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int) -> LocalModels:
+def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int, labels=None) -> LocalModels:
     """Local models of `states`, whose members are the rows of a boolean matrix, padded to `width` states."""
     count, num_actions = len(states), graph.num_actions
     members, model, local, position = _numbered(states, rows, width)
@@ -167,13 +185,11 @@ def _restrict(graph: HostGraph, states, rows: scipy.sparse.csr_array, width: int
     weight = graph.probability[entry].astype(np.float64)
     flat = np.bincount(row * width + target, weight, minlength=np.prod(shape, dtype=np.int64))
     transition = flat.reshape(shape).astype(graph.dtype)
-    labels = None
-    if graph.refused is not None:
-        labels = np.zeros((count, width, num_actions, 1), graph.dtype)
-        labels[model, local, :, 0] = graph.refused[rows.indices]
-    return LocalModels(
-        members=members, size=np.diff(rows.indptr).astype(np.int32), transition=transition, labels=labels
-    )
+    marks = None
+    if labels is not None:
+        marks = np.zeros((count, width, *labels.shape[1:]), graph.dtype)
+        marks[model, local] = labels[rows.indices]
+    return LocalModels(members=members, size=np.diff(rows.indptr).astype(np.int32), transition=transition, labels=marks)
 
 
 def _numbered(states, rows: scipy.sparse.csr_array, width: int):

@@ -8,6 +8,7 @@ Probabilities, allowed actions and the states themselves are traced: transitions
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,50 +23,80 @@ from jaxhom.similarity.brackets import Goal, LocalSimilarity
 from jaxhom.similarity.local_models import LocalIndices, local_indices
 
 
+class TracedStates(NamedTuple):
+    """One side of the pairs.
+
+    Attributes:
+      mdp: the model.
+      states: int [P].
+      labels: [S, A, L] or None.
+      graph_of: the model whose graph counts, `mdp` itself or a concrete one of the same shape.
+      name: of the states.
+    """
+
+    mdp: MDP
+    states: jax.Array | np.ndarray
+    labels: jax.Array | np.ndarray | None
+    graph_of: MDP
+    name: str
+
+
 def brackets_in_program(
-    mdp: MDP, sources, targets, goal: Goal, *, graph_of: MDP, distance: int, anchored: bool, name: str
+    source: TracedStates, target: TracedStates, goal: Goal, *, distance: int, anchored: bool, name: str
 ) -> LocalSimilarity:
-    """As `SimilarityTable.brackets`, of JAX arrays, where the model's arrays or the states are traced.
+    """As `SimilarityTable.brackets`, of JAX arrays, where the models' arrays or the states are traced.
 
     Args:
-      mdp, sources, targets: as in `local_similarity`.
+      source, target: of one model or of two.
       goal: what to settle for; "auto" is PDHG.
-      graph_of: the model whose graph counts, `mdp` itself or a concrete one of the same shape.
       distance, anchored: as in `local_similarity`.
       name: of the public function.
 
     Raises:
-      ValueError: if the graph is traced, states do not fit, or there are too many indices.
+      ValueError: if a graph is traced, states do not fit, or there are too many indices.
     """
     checks.require_count("distance", distance)
-    sources, targets = _checked_states(mdp, sources, "sources"), _checked_states(mdp, targets, "targets")
-    checks.require_shape("targets", targets, str(sources.shape), len(sources) == len(targets))
-    graph, next_state, is_open = _concrete_graph(graph_of)
-    sides = []
-    for states in (sources, targets):
-        everyone = np.arange(mdp.num_states) if checks.is_traced(states) else np.unique(states)
+    source, target = (side._replace(states=_checked_states(side)) for side in (source, target))
+    fits = len(source.states) == len(target.states)
+    checks.require_shape(target.name, target.states, str(source.states.shape), fits)
+    has_refused = source.mdp.restricts_actions or target.mdp.restricts_actions
+    transitions, labels, sizes = [], [], []
+    for side in (source, target):
+        graph, next_state, is_open = _concrete_graph(side.graph_of)
+        is_traced = checks.is_traced(side.states)
+        everyone = np.arange(side.mdp.num_states) if is_traced else np.unique(side.states)
         indices = local_indices(graph, next_state, is_open, everyone, distance)
-        which = states if checks.is_traced(states) else np.searchsorted(everyone, states)
-        sides.append(_gathered(mdp, indices, which))
-    (source, own_labels, own_size), (target, other_labels, other_size) = sides
-    labels = (own_labels, other_labels) if mdp.restricts_actions else ()
+        which = side.states if is_traced else np.searchsorted(everyone, side.states)
+        transitions.append(_gathered(side.mdp, indices, which))
+        labels.append(_gathered_labels(side, jnp.asarray(indices.members)[which], has_refused))
+        sizes.append(jnp.asarray(indices.size)[which])
     if goal.method == "auto":
         goal = goal._replace(method="pdhg")
-    found = differentiable_bounds((source, target, labels), (own_size, other_size), goal, bool(anchored), name)
+    models = *transitions, () if labels[0] is None else tuple(labels)
+    found = differentiable_bounds(models, tuple(sizes), goal, bool(anchored), name)
     return found.replace(lower=not_negative(found.lower))
 
 
-def _gathered(mdp: MDP, indices: LocalIndices, which) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Transitions [P, n, A, n], labels [P, n, A, 1] and sizes [P] of the given ones of the local models."""
+def _gathered(mdp: MDP, indices: LocalIndices, which) -> jax.Array:
+    """Transitions [P, n, A, n] of the given ones of the local models."""
     members, successor = jnp.asarray(indices.members)[which], jnp.asarray(indices.successor)[which]
     allowed = jnp.asarray(mdp.allowed)[members]  # padding reads the last state, whose numbers go nowhere
     weight = jnp.where(allowed[..., None], mdp.probability[members], 0.0)
     count, n, num_actions, _ = successor.shape
     p, i, a = np.ogrid[:count, :n, :num_actions]
     zeros = jnp.zeros((count, n, num_actions, n), mdp.dtype)
-    transition = zeros.at[p[..., None], i[..., None], a[..., None], successor].add(weight, mode="drop")
-    refused = (members >= 0)[..., None] & ~allowed
-    return transition, refused[..., None].astype(mdp.dtype), jnp.asarray(indices.size)[which]
+    return zeros.at[p[..., None], i[..., None], a[..., None], successor].add(weight, mode="drop")
+
+
+def _gathered_labels(side: TracedStates, members: jax.Array, has_refused: bool) -> jax.Array | None:
+    """Labels [P, n, A, L] of members [P, n]: those that were given, and last the one of actions not allowed."""
+    parts = [] if side.labels is None else [jnp.asarray(side.labels, side.mdp.dtype)]
+    if has_refused:
+        parts.append(~jnp.asarray(side.mdp.allowed)[..., None])
+    if not parts:
+        return None
+    labels = jnp.concatenate([part.astype(side.mdp.dtype) for part in parts], axis=2)
+    return jnp.where((members >= 0)[..., None, None], labels[members], 0.0)
 
 
 def _concrete_graph(mdp: MDP) -> tuple[HostGraph, np.ndarray, np.ndarray]:
@@ -91,8 +122,9 @@ def _concrete_graph(mdp: MDP) -> tuple[HostGraph, np.ndarray, np.ndarray]:
     return HostGraph(skeleton), np.asarray(mdp.next_state), is_open
 
 
-def _checked_states(mdp: MDP, states, name: str):
+def _checked_states(side: TracedStates):
     """States [P], NumPy where they are concrete."""
+    mdp, states, name = side.mdp, side.states, side.name
     if not checks.is_traced(states):
         return check_states(mdp, states, name)
     checks.require_shape(name, states, "[P]", states.ndim == 1)

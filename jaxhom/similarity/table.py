@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.models.graph import host_graph
-from jaxhom.models.inputs import as_model, check_states
+from jaxhom.models.inputs import as_model, check_labels, check_states
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
-from jaxhom.similarity.class_pairs import ClassPairs
+from jaxhom.similarity.class_pairs import ClassModels
 from jaxhom.similarity.classes import ClassBook
 from jaxhom.similarity.decisions import (
     Decisions,
@@ -31,10 +31,11 @@ from jaxhom.similarity.decisions import (
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys
+from jaxhom.similarity.relations import UserRelation, pair_errors
 from jaxhom.solvers.lane_queue import is_settled
 
 if TYPE_CHECKING:
-    from jaxtyping import ArrayLike, Int
+    from jaxtyping import ArrayLike, Int, Num
 
 _MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}  # below what an explanation prints
 
@@ -45,14 +46,32 @@ class SimilarityTable:
     Args:
       mdp: the model, concrete; or what has one as `.mdp`.
       distance: d >= 1, the radius of the local models.
-      anchored: require that the centre is mapped to the centre; False is the program as printed.
+      anchored: require that the centre is mapped to the centre; False is the program as printed. Graph kernels then
+        tell the centre from other states no more.
+      labels: [S, A, L], or [S, L] for labels of the state, what a map has to keep besides transitions: the error also
+        bounds |l(i, a) - sum_k f(i, k) l'(k, a)| for every label. A reward [S, A] is one label, `mdp.features` are K.
+        They count as they are: in [0, 1] a difference weighs like one of probabilities.
+      label_weight: what labels are multiplied by.
+      relation: what the errors of a pair of local models are.
+
+        * "homomorphism": the error of LP (9).
+        * "isomorphic": 0 if the models are equal up to a renaming of states that keeps the centre, or else 1.
+        * "weisfeiler_lehman": 1 - k for the subtree kernel of colours in three rounds of refinement (Shervashidze et
+          al. 2011), normalised; colours are of probabilities, labels and actions, along transitions both ways.
+        * "random_walk": 1 - k for the walks that both models have in common (Vishwanathan et al. 2007), normalised.
+        * "lax": the error of LP (9), the least over all permutations of the target's actions, up to 6 of them
+          (Taylor et al. 2008). Votes are renamed back by the permutation.
+        * a function of two local models, source and target, with `.states`, `.transition` [n, A, n] and `.labels`
+          [n, A, L] or None in NumPy: it returns whether they are similar, an error of at least 0, or bounds on one.
 
     Attributes:
       mdp, distance, anchored: as given.
+      labels: [S, A, L], weighted; None if none were given.
+      compares: the relation as given; its name if it is a function.
       num_solved: how many programs have been solved, each for a pair of classes.
 
     Raises:
-      ValueError: if the model is traced or the distance below 1.
+      ValueError: if the model is traced, an option out of range, or labels do not fit.
 
     The table grows by what it is asked; it belongs to the host and is no pytree. It takes concrete values alone, inside
     jit, vmap and grad too. Completed, it answers for traced demonstrations: see `complete`.
@@ -71,22 +90,47 @@ class SimilarityTable:
     """
 
     @checks.eager_where_concrete
-    def __init__(self, mdp: MDP, *, distance: int = 1, anchored: bool = True):
+    def __init__(
+        self,
+        mdp: MDP,
+        *,
+        distance: int = 1,
+        anchored: bool = True,
+        labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
+        label_weight: float = 1.0,
+        relation: str | UserRelation = "homomorphism",
+    ):
         self.mdp = as_model(mdp)
         require_concrete(self.mdp)
+        checks.refuse_traced(labels=labels, label_weight=label_weight)
         self.distance, self.anchored = checks.require_count("distance", distance), bool(anchored)
-        self._maker = LocalModelMaker(host_graph(self.mdp), self.distance)
+        self.labels = None if labels is None else check_labels(self.mdp, labels, label_weight)
+        self.given_relation = relation
+        self._maker = LocalModelMaker(host_graph(self.mdp), self.distance, self.labels)
         self._book = ClassBook(self._maker)
-        self._pairs = ClassPairs(self._maker, self._book, self.anchored)
+        self._pairs = pair_errors(relation, ClassModels(self._maker, self._book), self.anchored)
         self._known = PairBounds(self.mdp.dtype)
         self._maps: dict[tuple[int, int], tuple[np.ndarray, LocalSimilarity]] = {}
 
     def __repr__(self) -> str:
         kind = "anchored" if self.anchored else "as printed"
+        kind += "" if self.compares == "homomorphism" else f", {self.compares}"
+        kind += "" if self.labels is None else f", {self.labels.shape[2]} labels"
         return (
             f"SimilarityTable({self.mdp.num_states} states, distance {self.distance}, {kind}; so far "
             f"{self.num_classes} classes, {len(self._known)} pairs of them)"
         )
+
+    @property
+    def compares(self) -> str:
+        """The name of the relation."""
+        given = self.given_relation
+        return given if isinstance(given, str) else getattr(given, "__name__", type(given).__name__)
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether a map stands behind an error: of LP (9), "homomorphism" and "lax"."""
+        return self._pairs.has_maps
 
     @property
     def num_classes(self) -> int:
@@ -228,6 +272,20 @@ class SimilarityTable:
         return Relation(label=label, similar=found.similar.reshape(square), status=found.status.reshape(square))
 
     @checks.eager_where_concrete
+    def renamings(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> np.ndarray | None:
+        """int [P, A]: which action of the target stands for each of the source's; None where each is itself.
+
+        For the relation "lax": the permutation of least error, of those as good to 1e-4 the first one that renames the
+        fewest actions.
+
+        Raises:
+          ValueError: as `local_similarity`.
+        """
+        pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
+        found = self._pairs.renamings(pairs)
+        return None if found is None else found[where]
+
+    @checks.eager_where_concrete
     def maps(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> CertifiedMaps:
         """Maps M^{s,d} to M^{s',d} for pairs (s, s') of states, each with as small an error as can be certified.
 
@@ -236,15 +294,18 @@ class SimilarityTable:
           targets: int [P], its s'.
 
         Returns:
-          `CertifiedMaps`; the bounds are 1e-6 apart (1e-4 in float32), or `status` says why not.
+          `CertifiedMaps`; the bounds are 1e-6 apart (1e-4 in float32), or `status` says why not. Of the relation "lax"
+          they are the maps to models with renamed actions, see `renamings`.
 
         Raises:
-          ValueError: as `local_similarity`.
+          ValueError: as `local_similarity`; or if the relation is one without maps.
 
         A map between the models that stand for two classes is solved for once, and carried over by renaming states.
 
         Source: Boularias and Chaib-draa 2010, eq. (9).
         """
+        if not self.has_maps:
+            raise ValueError(f"there are no maps behind the relation {self.compares}")
         sources, targets = self._validated_pairs(sources, targets)
         pairs, where = self._pairs_of(sources, targets)
         goal = Goal(tolerance=_MAP_TOLERANCE[np.dtype(self.mdp.dtype).name], method="pdhg")

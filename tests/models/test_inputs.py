@@ -6,7 +6,7 @@ import pytest
 
 import jaxhom
 from jaxhom import MDP
-from jaxhom.models.inputs import check_coordinates, check_policy
+from jaxhom.models.inputs import check_coordinates, check_labels, check_policy
 from jaxhom.models.mdp import absorbing_states, uniform_policy
 
 # Two states, three actions; action 2 exists in state 1 alone, where it stays.
@@ -185,3 +185,39 @@ def test_coordinates_that_do_not_fit_are_refused(coordinates, message):
     with pytest.raises(ValueError, match=message):
         check_coordinates(mdp, coordinates)
     assert check_coordinates(mdp, [[1], [2]]).dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("labels", "weight", "message"),
+    [
+        (np.zeros(2), 1.0, r"tags must have shape \(2, 3, L\) or \(2, L\), got \(2,\)"),
+        (np.zeros((3, 1)), 1.0, r"tags must have shape"),
+        (np.zeros((2, 2, 1)), 1.0, r"tags must have shape"),
+        ([[0.0], [np.nan]], 1.0, r"tags\[1, 0\] must be finite, got nan"),
+        ([[[0.0], [np.inf], [0.0]]] * 2, 1.0, r"tags\[0, 1, 0\] must be finite, got inf"),
+        ([["a"], ["b"]], 1.0, "tags must hold real numbers"),
+        ([[0.0], [1.0]], -1.0, "label_weight must not be negative, got -1"),
+        ([[0.0], [1.0]], np.nan, "label_weight must be finite"),
+        ([[0.0], [1.0]], [1.0], r"label_weight must have shape \(\), got \(1,\)"),
+        ([[0.0], [1e308]], 10.0, r"label_weight \* tags\[1, 0\] must be finite, got inf"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused(labels, weight, message):
+    with pytest.raises(ValueError, match=message):
+        check_labels(model(), labels, weight, "tags")
+
+
+def test_labels_of_states_count_for_every_action_and_are_weighted():
+    labels = check_labels(model(), [[1, 2], [3, 4]], 0.5)
+    assert labels.dtype == model().dtype and labels.shape == (2, 3, 2)
+    np.testing.assert_array_equal(labels, np.broadcast_to([[[0.5, 1.0]], [[1.5, 2.0]]], (2, 3, 2)))
+    again = jax.jit(lambda labels, weight: check_labels(model(), labels, weight))(np.array([[1, 2], [3, 4]]), 0.5)
+    np.testing.assert_array_equal(again, labels)
+
+
+def test_labels_where_an_action_is_not_allowed_count_unless_they_are_not_finite():
+    given = np.arange(12.0).reshape(2, 3, 2)
+    given[0, 2, 0] = np.nan
+    expected = np.where(np.isnan(given), 0, given)
+    np.testing.assert_array_equal(check_labels(model(), given), expected)
+    np.testing.assert_array_equal(jax.jit(lambda labels: check_labels(model(), labels))(given), expected)

@@ -1,0 +1,164 @@
+"""LP (9) minimised over permutations of actions: local models that are alike once the target's actions are renamed.
+
+Lax homomorphisms let every state have actions of its own that stand for those of its image (Taylor, Precup and
+Panangaden 2008, after Ravindran and Barto 2004); here one permutation serves a whole local model. The error of a pair
+is the least over all permutations, found by going through them, those first that rename the fewest actions; whatever a
+bound already excludes is not solved. The permutation that is carried over to votes is the first one with that error.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom.similarity.class_pairs import ClassModels, ClassPairs
+from jaxhom.similarity.local_models import LocalModels
+from jaxhom.status import Status
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+MAX_ACTIONS = 6  # 720 permutations
+_CHUNK = 2**24  # actions of permutations of pairs at a time
+_TOLERANCE = 1e-4  # to which errors are told apart for the choice of a permutation
+
+
+class LaxPairs:
+    """Solves LP (9) between classes for the best permutation of the target's actions.
+
+    Args:
+      models: those that stand for the classes.
+      anchored: require that the centre is mapped to the centre.
+
+    Raises:
+      ValueError: if there are more than 6 actions.
+    """
+
+    has_maps = True
+
+    def __init__(self, models: ClassModels, anchored: bool):
+        num_actions = models.num_actions
+        if num_actions > MAX_ACTIONS:
+            raise ValueError(
+                f'relation="lax" tries all permutations of at most {MAX_ACTIONS} actions, and the model has '
+                f"{num_actions}"
+            )
+        orders = list(itertools.permutations(range(num_actions)))
+        self._orders = np.array(sorted(orders, key=lambda order: sum(a != b for a, b in enumerate(order))), np.int32)
+        self._anchored, self._models = anchored, models
+        self._programs = ClassPairs(_RenamedModels(models, self._orders), anchored)
+        self._chosen: dict[tuple[int, int], int] = {}
+
+    @property
+    def num_solved(self) -> int:
+        """How many programs have been solved."""
+        return self._programs.num_solved
+
+    def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+        """Bounds on the least errors of different ordered pairs of classes."""
+        free = self._free_bounds(pairs)
+        lower, best = free.copy(), np.full(len(pairs), np.inf)
+        chosen_upper, chosen = np.full(len(pairs), np.inf), np.zeros(len(pairs), int)
+        iterations, status = np.zeros(len(pairs), np.int32), np.full(len(pairs), Status.SOLVED, np.int32)
+        for rank in range(len(self._orders)):
+            is_open = lower[:, rank] < best - goal.tolerance
+            if goal.decides:
+                is_open &= (lower[:, rank] <= goal.threshold) & ~(best <= goal.threshold + goal.tolerance)
+            (asked,) = np.nonzero(is_open)
+            if not asked.size:
+                continue
+            found = self._programs.brackets(self._renamed(pairs[asked], rank), goal, progress=progress)
+            lower[asked, rank] = np.fmax(lower[asked, rank], found.lower)
+            best[asked] = np.minimum(best[asked], found.upper)
+            iterations[asked] += found.iterations
+            status[asked] = np.maximum(status[asked], found.status)
+            is_better = found.upper < chosen_upper[asked] - goal.tolerance
+            chosen[asked[is_better]], chosen_upper[asked[is_better]] = rank, found.upper[is_better]
+        if not goal.decides:
+            self._chosen.update(zip(map(tuple, pairs.tolist()), chosen.tolist(), strict=True))
+        dtype = self._programs.dtype
+        least = np.minimum(lower.min(axis=1), best).astype(dtype)
+        upper = np.where(np.isfinite(best), best, self._programs.most).astype(dtype)
+        status = np.where(goal.is_met(least, upper), Status.SOLVED, status).astype(np.int32)
+        return LocalSimilarity(lower=least, upper=upper, iterations=iterations, status=status)
+
+    def slack(self, pairs: Int[np.ndarray, "Q 2"]) -> Float[np.ndarray, " Q"]:
+        """As `ClassPairs.slack`."""
+        return self._programs.slack(self._renamed(pairs, 0))
+
+    def tolerance(self, goal: Goal, slack):
+        """As `ClassPairs.tolerance`."""
+        return self._programs.tolerance(goal, slack)
+
+    def map_of(self, pair: Int[np.ndarray, " 2"], goal: Goal) -> tuple[LocalSimilarity, Float[np.ndarray, "n m"]]:
+        """Bounds [1] for one pair of classes, and a map [n, m] to the renamed model."""
+        self.renamings(pair[None])
+        rank = self._chosen[tuple(pair.tolist())]
+        return self._programs.map_of(self._renamed(pair[None], rank)[0], goal)
+
+    def renamings(self, pairs: Int[np.ndarray, "Q 2"]) -> Int[np.ndarray, "Q A"]:
+        """Which action of the target stands for each of the source's."""
+        keys = list(map(tuple, pairs.tolist()))
+        missing = sorted({key for key in keys if key not in self._chosen})
+        if missing:
+            self.brackets(np.array(missing), Goal(tolerance=_TOLERANCE))
+        return self._orders[[self._chosen[key] for key in keys]]
+
+    def _renamed(self, pairs, rank) -> Int[np.ndarray, "Q 2"]:
+        """The pairs with the actions of the targets renamed, as `_RenamedModels` numbers them."""
+        return pairs + np.array([0, rank * len(self._models.size)])
+
+    def _free_bounds(self, pairs) -> Float[np.ndarray, "Q R"]:
+        """What the centres alone say of every permutation; 0 where they may be mapped elsewhere."""
+        if not self._anchored:
+            return np.zeros((len(pairs), len(self._orders)))
+        result, actions = np.zeros((len(pairs), len(self._orders))), np.arange(self._orders.shape[1])
+        for index, source, target in self._models.of_pairs(pairs):
+            for part in np.array_split(np.arange(len(index)), 1 + len(index) * self._orders.size // _CHUNK):
+                apart = _centre_errors(
+                    *(jax.tree.map(lambda leaf, part=part: leaf[part], side) for side in (source, target))
+                )
+                result[index[part]] = apart[:, actions, self._orders].max(axis=2)
+        return result
+
+
+def _centre_errors(source: LocalModels, target: LocalModels) -> Float[np.ndarray, "Q A A"]:
+    """Lower bounds on the error where an action of the target stands for one of the source, from the centres' rows.
+
+    As `free_bounds`: what stays can only gain from maps of the other states, what leaves is all that can arrive.
+    """
+    own, other = (np.asarray(side.transition[:, 0], float) for side in (source, target))
+    apart = own[:, :, None, 0] - other[:, None, :, 0]
+    arrives = other[:, :, 1:].max(axis=2, initial=-1.0)
+    apart = np.maximum(apart, arrives[:, None] - own[:, :, 1:].sum(axis=2)[:, :, None])
+    apart -= (8.0 + own.shape[2]) * np.finfo(own.dtype).eps
+    if source.labels is not None:
+        own, other = (np.asarray(side.labels[:, 0], float) for side in (source, target))
+        of_labels = np.abs(own[:, :, None] - other[:, None]).max(axis=3, initial=0.0)
+        apart = np.maximum(apart, of_labels * (1.0 - 4.0 * np.finfo(float).eps))
+    return np.maximum(apart, 0.0)
+
+
+class _RenamedModels(ClassModels):
+    """C classes once more for each of R permutations: class r C + c is class c with action order[a] in place of a."""
+
+    def __init__(self, models: ClassModels, orders: Int[np.ndarray, "R A"]):
+        vars(self).update(vars(models))
+        self._plain, self._orders = models, orders
+
+    @property
+    def size(self) -> np.ndarray:
+        return np.tile(self._plain.size, len(self._orders))
+
+    def of(self, classes: np.ndarray, width: int) -> LocalModels:
+        rank, number = np.divmod(classes, len(self._plain.size))
+        models, order = self._plain.of(number, width), self._orders[rank][:, None]
+        labels = models.labels
+        return models.replace(
+            transition=np.take_along_axis(models.transition, order[..., None], axis=2),
+            labels=None if labels is None else np.take_along_axis(labels, order[..., None], axis=2),
+        )

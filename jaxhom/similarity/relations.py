@@ -1,0 +1,213 @@
+"""Relations between classes of local models: what a table of similarities is about.
+
+A relation gives every ordered pair of classes an error that is bounded from both sides; a state is similar to another
+if that error is within a threshold. LP (9) is one of them (`class_pairs`), its minimum over permutations of actions
+another (`lax_pairs`). Here are those that need no program: isomorphism, graph kernels, and functions of the user's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxhom import checks
+from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom.similarity.class_pairs import ClassModels, ClassPairs, LocalModel
+from jaxhom.similarity.classes import quantum_bits
+from jaxhom.similarity.graph_kernels import colour_counts, cosines, walks_in_common
+from jaxhom.similarity.lax_pairs import LaxPairs
+from jaxhom.similarity.local_models import is_oversized
+from jaxhom.status import Status
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+RELATIONS = ("homomorphism", "isomorphic", "weisfeiler_lehman", "random_walk", "lax")
+_ROUNDING = 64.0  # times eps: of a normalised kernel
+
+
+UserRelation = Callable[[LocalModel, LocalModel], "bool | float | tuple[float, float]"]
+
+
+class PairErrors(Protocol):
+    """The errors of a relation.
+
+    Attributes:
+      num_solved: how many programs have been solved.
+      has_maps: whether a map stands behind an error.
+    """
+
+    num_solved: int
+    has_maps: bool
+
+    def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+        """Bounds for different ordered pairs of classes."""
+
+    def slack(self, pairs: Int[np.ndarray, "Q 2"]) -> Float[np.ndarray, " Q"]:
+        """How far the errors of other members of two classes can lie from those of the models that stand for them."""
+
+    def tolerance(self, goal: Goal, slack):
+        """What bounds have to reach before they are widened by `slack`."""
+
+    def map_of(self, pair: Int[np.ndarray, " 2"], goal: Goal) -> tuple[LocalSimilarity, Float[np.ndarray, "n m"]]:
+        """Bounds [1] of one pair, and the map that proves the upper one."""
+
+    def renamings(self, pairs: Int[np.ndarray, "Q 2"]) -> Int[np.ndarray, "Q A"] | None:
+        """Which action of the target stands for each of the source's; None where every action is itself."""
+
+
+def pair_errors(relation: str | UserRelation, models: ClassModels, anchored: bool) -> PairErrors:
+    """The errors of a relation, given by its name or as a function; or `ValueError`.
+
+    Args:
+      relation: one of `RELATIONS`, or a function of two `LocalModel`s.
+      models: those that stand for the classes.
+      anchored: whether centres are told from other states.
+    """
+    if callable(relation):
+        return _ByFunction(models, relation)
+    if not isinstance(relation, str) or relation not in RELATIONS:
+        raise ValueError(f"relation must be one of {RELATIONS} or a function, got {checks.in_one_line(relation)}")
+    kinds = (ClassPairs, _Isomorphic, _WeisfeilerLehman, _RandomWalk, LaxPairs)
+    return dict(zip(RELATIONS, kinds, strict=True))[relation](models, anchored)
+
+
+class _WithoutPrograms:
+    """What relations have in common whose errors are computed and not searched for."""
+
+    num_solved = 0
+    has_maps = False
+
+    def __init__(self, models: ClassModels, anchored: bool):
+        self._models, self._anchored, self._dtype = models, anchored, models.dtype
+
+    def brackets(self, pairs, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+        """Bounds; nothing but that they are at most 1 for models that are too large to be looked at."""
+        del goal
+        is_large = is_oversized(self._models.size, self._models.num_actions)[pairs].any(axis=1)
+        bounds = np.tile([0.0, 1.0], (len(pairs), 1))
+        with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
+            bar.update(int(is_large.sum()))
+            bounds[~is_large] = self._bounds(pairs[~is_large], bar.update)
+        lower, upper = bounds.T
+        return LocalSimilarity(
+            lower=np.maximum(_towards(lower, -np.inf, self._dtype), 0.0),
+            upper=_towards(upper, np.inf, self._dtype),
+            iterations=np.zeros(len(pairs), np.int32),
+            status=np.where(is_large, Status.ITERATION_LIMIT, Status.SOLVED).astype(np.int32),
+        )
+
+    def _bounds(self, pairs, progress: Callable[[int], object]) -> Float[np.ndarray, "Q 2"]:
+        """Lower and upper bounds of pairs of models that are not too large."""
+        raise NotImplementedError
+
+    def slack(self, pairs):
+        return np.zeros(len(pairs), self._dtype)
+
+    def tolerance(self, goal: Goal, slack):
+        del slack
+        return goal.tolerance
+
+    def map_of(self, pair, goal):
+        raise ValueError("only errors of programs have maps behind them")
+
+    def renamings(self, pairs):
+        del pairs
+
+
+class _Isomorphic(_WithoutPrograms):
+    """0 for a class against itself, 1 for any other: local models that are equal up to a renaming of states."""
+
+    def _bounds(self, pairs, progress):
+        progress(len(pairs))
+        return np.repeat(pairs[:, :1] != pairs[:, 1:], 2, axis=1)
+
+    def brackets(self, pairs, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+        """Models that are too large to be looked at are alone in their classes."""
+        found = super().brackets(pairs, goal, progress=progress)
+        error = (pairs[:, 0] != pairs[:, 1]).astype(self._dtype)
+        return found.replace(lower=error, upper=error.copy(), status=np.full(len(pairs), Status.SOLVED, np.int32))
+
+
+class _WeisfeilerLehman(_WithoutPrograms):
+    """1 - k for the normalised Weisfeiler-Lehman kernel."""
+
+    _features = None
+
+    def _bounds(self, pairs, progress):
+        models = self._models
+        if self._features is None or self._features.shape[0] < len(models.size):
+            known = [models.alone(number, most=1.0) for number in range(len(models.size))]
+            self._features = colour_counts(known, quantum_bits(self._dtype), anchored=self._anchored)
+        progress(len(pairs))
+        return _one_minus(cosines(self._features, pairs))
+
+
+class _RandomWalk(_WithoutPrograms):
+    """1 - k for the normalised random-walk kernel."""
+
+    def __init__(self, models: ClassModels, anchored: bool):
+        super().__init__(models, anchored)
+        self._own = np.zeros(0)
+
+    def _bounds(self, pairs, progress):
+        fresh = np.arange(len(self._own), len(self._models.size))
+        self._own = np.append(self._own, self._kernel(np.stack([fresh, fresh], axis=1)))
+        return _one_minus(self._kernel(pairs, progress) / np.sqrt(self._own[pairs].prod(axis=1)))
+
+    def _kernel(self, pairs, progress=None):
+        result = np.ones(len(pairs))
+        for index, source, target in self._models.of_pairs(pairs):
+            labels = () if source.labels is None else (source.labels, target.labels)
+            sides = source.transition, target.transition, source.size, target.size
+            result[index] = walks_in_common(*sides, labels, anchored=self._anchored)
+            if progress:
+                progress(len(index))
+        return result
+
+
+class _ByFunction(_WithoutPrograms):
+    """What a function of the user's says of two models: whether they are similar, an error, or bounds on one."""
+
+    def __init__(self, models: ClassModels, function: UserRelation):
+        super().__init__(models, True)
+        self._function = function
+
+    def _bounds(self, pairs, progress):
+        known = {number: self._models.alone(number) for number in np.unique(pairs).tolist()}
+        bounds = np.zeros((len(pairs), 2))
+        for number, (source, target) in enumerate(pairs.tolist()):
+            bounds[number] = self._ask(known[source], known[target])
+            progress(1)
+        return bounds
+
+    def _ask(self, source: LocalModel, target: LocalModel) -> tuple[float, float]:
+        said = self._function(source, target)
+        if isinstance(said, bool | np.bool_):
+            return (0.0, 0.0) if said else (1.0, 1.0)
+        try:
+            lower, upper = map(float, said if isinstance(said, tuple) else (said, said))
+        except (TypeError, ValueError):
+            lower = upper = np.nan
+        if not 0.0 <= lower <= upper:
+            raise ValueError(
+                "relation must return a bool, an error of at least 0, or a pair lower <= upper of such; for the local "
+                f"models of states {source.states[0]} and {target.states[0]} it returned {checks.in_one_line(said)}"
+            )
+        return lower, upper
+
+
+def _one_minus(kernel) -> Float[np.ndarray, "Q 2"]:
+    """Bounds on 1 - k, which rounding may be below 0."""
+    rounding = _ROUNDING * np.finfo(float).eps
+    return np.clip(1.0 - kernel, 0.0, 1.0)[:, None] + np.array([-rounding, rounding])
+
+
+def _towards(bound, direction: float, dtype):
+    """The nearest number of the type on that side."""
+    rounded = bound.astype(dtype)
+    is_wrong = (rounded < bound) if direction > 0 else (rounded > bound)
+    return np.where(is_wrong, np.nextafter(rounded, np.asarray(direction, dtype)), rounded)

@@ -23,10 +23,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jaxhom.similarity.model_pairs import ModelPairs
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 _MAX_EXPECTATIONS = 512  # per model: with many actions, those of two steps ahead are left out
+_CHUNK_ENTRIES = 2**21  # of expectations that are compared at a time
 _EPS = np.finfo(np.float64).eps
 
 
@@ -86,33 +89,21 @@ class Profile(NamedTuple):
             largest=np.abs(labels).max(axis=(1, 2, 3), initial=0.0),
         )
 
-    @property
-    def num_entries(self) -> int:
-        """Numbers of one model, about."""
-        return sum(leaf[:1].size for leaf in self)
-
     def of_models(self, index) -> Profile:
         """Those of some of the models."""
         return Profile(*(leaf[index] for leaf in self))
 
-    def placed(self, index, count: int, others: Profile | None) -> Profile:
-        """Profiles of `count` models: these at the places `index`, and the others' where they had theirs."""
-        leaves = [np.zeros((count, *leaf.shape[1:]), leaf.dtype) for leaf in self]
-        for k, leaf in enumerate(leaves):
-            if others is not None:
-                leaf[: len(others[k])] = others[k]
-            leaf[index] = self[k]
-        return Profile(*leaves)
 
-
-def lower_bounds_without_iterations(source, target, source_labels=None, target_labels=None) -> np.ndarray:
-    """Lower bounds on the anchored errors of P pairs, [P], in their type.
-
-    Args:
-      source, target, source_labels, target_labels: NumPy, as in `bracket_errors`.
-    """
-    bounds = lower_bounds(Profile.of(source, source_labels), Profile.of(target, target_labels))
-    return rounded_down(bounds, source.dtype)
+def lower_bounds_without_iterations(models: ModelPairs) -> Float[np.ndarray, " P"]:
+    """Lower bounds on the anchored errors of P pairs of models, in their type."""
+    sides = Profile.of(models.source, models.source_labels), Profile.of(models.target, models.target_labels)
+    bounds = np.zeros(len(models.pairs), models.dtype)
+    chunk = max(1, _CHUNK_ENTRIES // max(1, *(leaf[:1].size for leaf in sides[0])))
+    for start in range(0, len(bounds), chunk):
+        part = slice(start, start + chunk)
+        chosen = (side.of_models(index) for side, index in zip(sides, models.pairs[part].T, strict=True))
+        bounds[part] = rounded_down(_lower_bounds(*chosen), models.dtype)
+    return bounds
 
 
 def rounded_down(bounds: np.ndarray, dtype) -> np.ndarray:
@@ -121,7 +112,7 @@ def rounded_down(bounds: np.ndarray, dtype) -> np.ndarray:
     return np.where(rounded > bounds, np.nextafter(rounded, rounded.dtype.type(0)), rounded)
 
 
-def lower_bounds(source: Profile, target: Profile) -> Float[np.ndarray, " P"]:
+def _lower_bounds(source: Profile, target: Profile) -> Float[np.ndarray, " P"]:
     """Lower bounds on the anchored errors of P pairs, from profiles [P] of both sides; float64, rounding included."""
     rounding = source.rounding + target.rounding
     staying = (source.stays - target.stays).max(axis=1)
@@ -138,13 +129,13 @@ def lower_bounds(source: Profile, target: Profile) -> Float[np.ndarray, " P"]:
     return np.maximum(bound, 0.0)
 
 
-def upper_bounds_without_iterations(source, source_labels, target_labels) -> np.ndarray:
-    """[P]: |K f| <= 1 for every map f, and what labels differ by is within their range."""
-    bound = np.ones(len(source), source.dtype)
-    if source_labels is None:
+def upper_bounds_without_iterations(models: ModelPairs) -> Float[np.ndarray, " P"]:
+    """|K f| <= 1 for every map f, and what labels differ by is within their range."""
+    bound = np.ones(len(models.pairs), models.dtype)
+    if models.source_labels is None:
         return bound
-    axes = (1, 2, 3)
-    highest = (labels.max(axis=axes, initial=0.0) for labels in (source_labels, target_labels))
-    lowest = (labels.min(axis=axes, initial=0.0) for labels in (source_labels, target_labels))
+    labels, pairs = (models.source_labels, models.target_labels), models.pairs.T
+    highest = (side.max(axis=(1, 2, 3), initial=0.0)[index] for side, index in zip(labels, pairs, strict=True))
+    lowest = (side.min(axis=(1, 2, 3), initial=0.0)[index] for side, index in zip(labels, pairs, strict=True))
     width = np.maximum(*highest) - np.minimum(*lowest)
-    return np.maximum(bound, width * (1.0 + 4.0 * np.finfo(source.dtype).eps)).astype(source.dtype)
+    return np.maximum(bound, width * (1.0 + 4.0 * np.finfo(models.dtype).eps)).astype(models.dtype)

@@ -23,41 +23,43 @@ import numpy as np
 import scipy
 
 from jaxhom.similarity.free_bounds import rounded_down
-from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import Certificate
+from jaxhom.similarity.model_pairs import ModelPairs
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 _LEVELS = (0.25,)  # tried before the threshold, where they are well above: what is proved there serves more thresholds
 _WELL_ABOVE = 2.0  # times the threshold
 _BAND_SHARE = 0.5  # of the tolerance, above the threshold: different is what is proved to be beyond that
 _LEAST_SHRINKAGE = 0.1  # of the widths, in a sweep: with less, they are left as they are
 _CHUNK_ENTRIES = 2**18  # of the slacks of the pairs that are looked at together: they fit into the cache
+_MAX_SHARES = 2**22  # of slacks at a time: 32 MB
 _EPS = np.finfo(np.float64).eps
 
 
 def bounds_by_intervals(
-    problem: HomomorphismProblem, threshold: float, tolerance: float
-) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
-    """Lower and upper bounds on the errors of P programs, 0 and infinity where nothing was found.
+    models: ModelPairs, asked: Int[np.ndarray, " Q"], threshold: float, tolerance: float
+) -> tuple[Float[np.ndarray, " Q"], Float[np.ndarray, " Q"]]:
+    """Lower and upper bounds on the errors of some pairs of models, 0 and infinity where nothing was found.
 
     A pair has either a lower bound above the threshold, or the error of a map, which need not be within it.
 
     Args:
-      problem: NumPy arrays.
+      models: the pairs.
+      asked: which of them.
       threshold, tolerance: of the decision; an error between threshold and threshold + tolerance may count as either.
     """
-    dtype = problem.source.dtype
-    n, num_actions, _, count = problem.source.shape
-    lower, upper = np.zeros(count, dtype), np.full(count, np.inf, dtype)
+    lower, upper = np.zeros(len(asked), models.dtype), np.full(len(asked), np.inf, models.dtype)
     base = threshold + _BAND_SHARE * tolerance
     levels = np.array([*(level for level in _LEVELS if level > _WELL_ABOVE * base), base])
-    proved = rounded_down(levels, dtype)
-    chunk = max(1, _CHUNK_ENTRIES // (2 * n * num_actions * (len(problem.target) + 2 * problem.num_labels)))
-    for start in range(0, count, chunk):
-        waiting = np.arange(start, min(start + chunk, count))
-        boxes = _Boxes.whole(Certificate(problem, waiting))
+    proved = rounded_down(levels, models.dtype)
+    sides = _Sides.of(models)
+    _, n, num_actions, _ = models.source.shape
+    chunk = max(1, _CHUNK_ENTRIES // (2 * n * num_actions * (models.target.shape[1] + 2 * models.num_labels)))
+    for start in range(0, len(asked), chunk):
+        waiting = np.arange(start, min(start + chunk, len(asked)))
+        boxes = sides.boxes(models.pairs[asked[waiting]])
         level = np.zeros(len(waiting), int)
         while waiting.size:
             before = boxes.widths()
@@ -66,7 +68,9 @@ def bounds_by_intervals(
             is_still = ~is_empty & ~(boxes.widths() < (1.0 - _LEAST_SHRINKAGE) * before)
             is_last = is_still & (level == len(levels) - 1)
             if is_last.any():
-                upper[waiting[is_last]] = boxes.part(is_last).errors_inside()
+                last = waiting[is_last]
+                maps = boxes.part(is_last).maps_inside()
+                upper[last] = Certificate(models.problem(asked[last]), slice(None)).upper(maps)
             level = level + is_still
             going = ~is_empty & ~is_last
             if not going.all():
@@ -89,22 +93,23 @@ class _Blocks(NamedTuple):
 
     @classmethod
     def of(cls, columns: Float[np.ndarray, "P columns rows"]) -> _Blocks:
+        """The transposes of matrices."""
         count, num_columns, num_rows = columns.shape
-        pair, column, row = np.nonzero(columns)
+        block, column, row = np.nonzero(columns)
         start = np.zeros(count * num_columns + 1, np.int64)
-        np.cumsum(np.bincount(pair * num_columns + column, minlength=count * num_columns), out=start[1:])
-        return cls(columns[pair, column, row], pair * num_rows + row, start, (num_rows, num_columns))
+        np.cumsum(np.bincount(block * num_columns + column, minlength=count * num_columns), out=start[1:])
+        return cls(columns[block, column, row], block * num_rows + row, start, (num_rows, num_columns))
 
-    def part(self, kept: Bool[np.ndarray, " P"]) -> _Blocks:
-        """Those of some pairs."""
-        rows, columns = self.shape
-        (old,) = np.nonzero(kept)
-        counts = np.diff(self.start).reshape(-1, columns)
-        in_pair = counts.sum(axis=1)
-        is_kept = np.repeat(kept, in_pair)
-        moved = np.repeat((old - np.arange(len(old))) * rows, in_pair[old])
-        start = np.append(0, np.cumsum(counts[old]))
-        return _Blocks(self.weight[is_kept], self.row[is_kept] - moved, start, self.shape)
+    def part(self, index: Int[np.ndarray, " Q"]) -> _Blocks:
+        """Some of the blocks, any of them as often as it is named."""
+        num_rows, num_columns = self.shape
+        counts = np.diff(self.start).reshape(-1, num_columns)[index]
+        sizes = counts.sum(axis=1)
+        start = np.append(0, np.cumsum(counts))
+        block = np.repeat(np.arange(len(index)), sizes)
+        entry = np.arange(start[-1]) + (self.start[index * num_columns] - start[:-1:num_columns])[block]
+        row = self.row[entry] + ((np.arange(len(index)) - index) * num_rows)[block]
+        return _Blocks(self.weight[entry], row, start, self.shape)
 
     def times(self, matrices: np.ndarray) -> np.ndarray:
         """Products with [P, columns, K]: [P, rows, K]."""
@@ -116,12 +121,68 @@ class _Blocks(NamedTuple):
     def least(self, slack: np.ndarray) -> np.ndarray:
         """Least of slack [P, rows, K] / weight over the entries of each column: [P, columns, K], infinite over none."""
         count, _, width = slack.shape
+        slack = slack.reshape(-1, width)
         found = np.full((len(self.start) - 1, width), np.inf)
         (filled,) = np.nonzero(np.diff(self.start))
-        if filled.size:
-            shares = slack.reshape(-1, width)[self.row] / self.weight[:, None]
-            found[filled] = np.minimum.reduceat(shares, self.start[filled], axis=0)
+        step = max(1, _MAX_SHARES // max(1, len(self.row)))
+        for first in range(0, width if filled.size else 0, step):
+            part = slice(first, first + step)
+            shares = slack[self.row, part] / self.weight[:, None]
+            found[filled, part] = np.minimum.reduceat(shares, self.start[filled], axis=0)
         return found.reshape(count, -1, width)
+
+
+class _Sides(NamedTuple):
+    """What boxes are made of, once for each model: blocks as `_Boxes` has them, and of labels the range in targets."""
+
+    source: _Blocks
+    target: _Blocks
+    is_row: np.ndarray
+    is_column: np.ndarray
+    labels: np.ndarray
+    least: np.ndarray
+    largest: np.ndarray
+    size: tuple[np.ndarray, np.ndarray]
+    anchored: bool
+
+    @classmethod
+    def of(cls, models: ModelPairs) -> _Sides:
+        """Of all models; labels that are not there are none."""
+        source, target = models.source.astype(np.float64), models.target.astype(np.float64)
+        ours, theirs = source[..., :0], target[..., :0]
+        if models.source_labels is not None:
+            ours, theirs = models.source_labels.astype(np.float64), models.target_labels.astype(np.float64)
+        is_row, is_column = models.masks()
+        is_state = is_column[:, :, None, None]
+        least = np.where(is_state, theirs, np.inf).min(axis=1)
+        largest = np.where(is_state, theirs, -np.inf).max(axis=1)
+        shifted = np.where(is_state, _from_both_ends(theirs, least[:, None], largest[:, None]), 0.0)
+        target = np.concatenate([target, shifted], axis=3)
+        return cls(
+            _Blocks.of(source.transpose(0, 3, 1, 2).reshape(*source.shape[:2], -1)),
+            _Blocks.of(target.reshape(*target.shape[:2], -1)),
+            is_row,
+            is_column,
+            ours,
+            least,
+            largest,
+            tuple(np.abs(side).max(axis=(1, 2, 3), initial=0.0) for side in (ours, theirs)),
+            models.anchored,
+        )
+
+    def boxes(self, pairs: Int[np.ndarray, "P 2"]) -> _Boxes:
+        """All maps of pairs of models, and those alone."""
+        one, other = pairs.T
+        is_row, is_column = self.is_row[one], self.is_column[other]
+        (count, n), m = is_row.shape, is_column.shape[1]
+        bounds = np.zeros((count, n, 2, m))
+        bounds[:, :, 1] = is_row[:, :, None] & is_column[:, None]
+        if self.anchored:
+            bounds[:, 0] = np.eye(m)[0]
+        labels = _from_both_ends(self.labels[one], self.least[other][:, None], self.largest[other][:, None])
+        labels = np.where(is_row[:, :, None, None], labels, 0.0).transpose(0, 2, 3, 1)
+        rounding = 8.0 * (n + m) ** 2 * _EPS * np.maximum(self.size[0][one] + self.size[1][other], 1.0)
+        return _Boxes(bounds, self.source.part(one), self.target.part(other), labels, is_row, rounding)
 
 
 class _Boxes(NamedTuple):
@@ -131,41 +192,21 @@ class _Boxes(NamedTuple):
       bounds: [P, n, 2, m], L and U.
       source: T, columns (i, a) by j. target: T' and labels, columns (a, k or label) by l.
       labels: [P, A, 2 L, n], what the sums of the labels' columns are to be.
+      is_row: bool [P, n], the states of the sources.
       rounding: [P], what sums can be off by.
-      certificate: of the pairs.
     """
 
     bounds: np.ndarray
     source: _Blocks
     target: _Blocks
     labels: np.ndarray
+    is_row: np.ndarray
     rounding: np.ndarray
-    certificate: Certificate
-
-    @classmethod
-    def whole(cls, certificate: Certificate) -> _Boxes:
-        """All maps, and those alone."""
-        (source, target, *labels), rows, columns = certificate.models, certificate.rows, certificate.columns
-        (count, n), m = rows.shape, columns.shape[1]
-        own, their = source[..., :0], target[..., :0]
-        if labels[0] is not None:
-            own, their = _from_both_ends(*labels, rows, columns)
-        bounds = np.zeros((count, n, 2, m))
-        bounds[:, :, 1] = rows[:, :, None] & columns[:, None]
-        if certificate.anchored:
-            bounds[:, 0] = np.eye(m)[0]
-        return cls(
-            bounds,
-            _Blocks.of(source.transpose(0, 3, 1, 2).reshape(count, n, -1)),
-            _Blocks.of(np.concatenate([target, their], axis=3).reshape(count, m, -1)),
-            own.transpose(0, 2, 3, 1),
-            8.0 * (n + m) ** 2 * _EPS * certificate.largest,
-            certificate,
-        )
 
     def part(self, kept: Bool[np.ndarray, " P"]) -> _Boxes:
         """Those of some pairs."""
-        return _Boxes(*(leaf.part(kept) if hasattr(leaf, "part") else leaf[kept] for leaf in self))
+        (index,) = np.nonzero(kept)
+        return _Boxes(*(leaf.part(index) if isinstance(leaf, _Blocks) else leaf[index] for leaf in self))
 
     def widths(self) -> Float[np.ndarray, " P"]:
         """Sums of U - L."""
@@ -194,29 +235,21 @@ class _Boxes(NamedTuple):
         new_low = np.maximum(low, high - room[:, :, 0] - 4.0 * _EPS)
         new_high = np.minimum(high, low + room[:, :, 1] + 4.0 * _EPS)
         sums, noise = (new_low.sum(axis=2), new_high.sum(axis=2)), 4.0 * m * m * _EPS
-        is_row = self.certificate.rows
-        is_empty |= (is_row & ((sums[0] > 1.0 + noise) | (sums[1] < 1.0 - noise))).any(axis=1)
+        is_empty |= (self.is_row & ((sums[0] > 1.0 + noise) | (sums[1] < 1.0 - noise))).any(axis=1)
         is_empty |= (new_low > new_high + noise).any(axis=(1, 2))
-        np.maximum(new_low, np.where(is_row, 1.0 - sums[1] - noise, 0.0)[:, :, None] + new_high, out=low)
-        np.minimum(new_high, np.where(is_row, 1.0 - sums[0] + noise, 0.0)[:, :, None] + new_low, out=high)
+        np.maximum(new_low, np.where(self.is_row, 1.0 - sums[1] - noise, 0.0)[:, :, None] + new_high, out=low)
+        np.minimum(new_high, np.where(self.is_row, 1.0 - sums[0] + noise, 0.0)[:, :, None] + new_low, out=high)
         return is_empty
 
-    def errors_inside(self) -> Float[np.ndarray, " P"]:
-        """Upper bounds from the maps that are at the same part of the way from L to U everywhere in a row."""
+    def maps_inside(self) -> Float[np.ndarray, "P n m"]:
+        """Those that are at the same part of the way from L to U everywhere in a row."""
         low, high = self.bounds[:, :, 0], self.bounds[:, :, 1]
         width = high - low
         total = width.sum(axis=2, keepdims=True)
         way = np.divide(1.0 - low.sum(axis=2, keepdims=True), total, out=np.zeros_like(total), where=total > 0.0)
-        return self.certificate.upper(low + way * width)
+        return low + way * width
 
 
-def _from_both_ends(ours, theirs, rows, columns) -> tuple[np.ndarray, np.ndarray]:
-    """Labels [P, n, A, 2 L] and [P, m, A, 2 L], less the least of l', and the largest less labels; l' is then >= 0."""
-    is_state = columns[:, :, None, None]
-    least = np.where(is_state, theirs, np.inf).min(axis=1, keepdims=True)
-    largest = np.where(is_state, theirs, -np.inf).max(axis=1, keepdims=True)
-
-    def both(labels, is_real):
-        return np.where(is_real, np.concatenate([labels - least, largest - labels], axis=3), 0.0)
-
-    return both(ours, rows[:, :, None, None]), both(theirs, is_state)
+def _from_both_ends(labels, least, largest) -> np.ndarray:
+    """[..., 2 L]: less the least of the target's, and the largest of the target's less them; those are then >= 0."""
+    return np.concatenate([labels - least, largest - labels], axis=-1)

@@ -33,7 +33,7 @@ _LEVELS = (0.25,)  # tried before the threshold, where they are well above: what
 _WELL_ABOVE = 2.0  # times the threshold
 _BAND_SHARE = 0.5  # of the tolerance, above the threshold: different is what is proved to be beyond that
 _LEAST_SHRINKAGE = 0.1  # of the widths, in a sweep: with less, they are left as they are
-_CHUNK_ENTRIES = 2**18  # of the slacks of the pairs that are looked at together: they fit into the cache
+_CHUNK_ENTRIES = 2**17  # of the slacks of the pairs that are looked at together: they fit into the cache
 _MAX_SHARES = 2**22  # of slacks at a time: 32 MB
 _EPS = np.finfo(np.float64).eps
 
@@ -62,8 +62,14 @@ def bounds_by_intervals(
         boxes = sides.boxes(models.pairs[asked[waiting]])
         level = np.zeros(len(waiting), int)
         while waiting.size:
+            slacks = boxes.slacks(levels[level])
+            is_empty = (slacks[1] < 0.0).any(axis=(1, 2, 3))
+            lower[waiting[is_empty]] = proved[level[is_empty]]
+            waiting, level, boxes = waiting[~is_empty], level[~is_empty], boxes.part(~is_empty)
+            if not waiting.size:
+                break
             before = boxes.widths()
-            is_empty = boxes.shrink(levels[level])
+            is_empty = boxes.shrink(*(slack[~is_empty] for slack in slacks))
             lower[waiting[is_empty]] = proved[level[is_empty]]
             is_still = ~is_empty & ~(boxes.widths() < (1.0 - _LEAST_SHRINKAGE) * before)
             is_last = is_still & (level == len(levels) - 1)
@@ -73,8 +79,7 @@ def bounds_by_intervals(
                 upper[last] = Certificate(models.problem(asked[last]), slice(None)).upper(maps)
             level = level + is_still
             going = ~is_empty & ~is_last
-            if not going.all():
-                boxes, waiting, level = boxes.part(going), waiting[going], level[going]
+            waiting, level, boxes = waiting[going], level[going], boxes.part(going)
     return lower, upper
 
 
@@ -119,8 +124,9 @@ class _Blocks(NamedTuple):
         return (whole @ matrices.reshape(-1, width)).reshape(count, -1, width)
 
     def least(self, slack: np.ndarray) -> np.ndarray:
-        """Least of slack [P, rows, K] / weight over the entries of each column: [P, columns, K], infinite over none."""
-        count, _, width = slack.shape
+        """Least of slack [P, rows, 2, K] / weight over entries of columns: [P, columns, 2, K], infinite over none."""
+        count, _, _, most = slack.shape
+        width = 2 * most
         slack = slack.reshape(-1, width)
         found = np.full((len(self.start) - 1, width), np.inf)
         (filled,) = np.nonzero(np.diff(self.start))
@@ -129,7 +135,7 @@ class _Blocks(NamedTuple):
             part = slice(first, first + step)
             shares = slack[self.row, part] / self.weight[:, None]
             found[filled, part] = np.minimum.reduceat(shares, self.start[filled], axis=0)
-        return found.reshape(count, -1, width)
+        return found.reshape(count, -1, 2, most)
 
 
 class _Sides(NamedTuple):
@@ -212,34 +218,38 @@ class _Boxes(NamedTuple):
         """Sums of U - L."""
         return (self.bounds[:, :, 1] - self.bounds[:, :, 0]).sum(axis=(1, 2))
 
-    def shrink(self, epsilon: Float[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
-        """One sweep for e <= epsilon, in place; which boxes are empty, rounding included."""
-        bounds = self.bounds
-        count, n, _, m = bounds.shape
+    def slacks(self, epsilon: Float[np.ndarray, " P"]) -> tuple[np.ndarray, np.ndarray]:
+        """How far sums are from where e > epsilon, [P, n A, 2, m] and, with labels, [P, A (m + 2 L), 2, n].
+
+        The first of two lets entries of the sum at hand fall, the second lets them rise: T f and f T' in turn.
+        """
+        count, n, _, m = self.bounds.shape
         allowed = (epsilon + self.rounding)[:, None, None, None]
-        ours = self.source.times(bounds.reshape(count, n, 2 * m)).reshape(count, n, -1, 2, m)
-        theirs = self.target.times(bounds.transpose(0, 3, 2, 1).reshape(count, m, 2 * n))
+        ours = self.source.times(self.bounds.reshape(count, n, 2 * m)).reshape(count, n, -1, 2, m)
+        theirs = self.target.times(self.bounds.transpose(0, 3, 2, 1).reshape(count, m, 2 * n))
         theirs = theirs.reshape(count, ours.shape[2], -1, 2, n)
         moved = theirs[:, :, :m].transpose(0, 4, 1, 3, 2)  # as `ours`
-        # How far one sum is from being too small, and the other: the first lets entries of T f fall, and of f T' rise.
-        slack = np.stack([ours[..., 1, :] - moved[..., 0, :], moved[..., 1, :] - ours[..., 0, :]], axis=3)
-        slack += allowed[..., None]
-        other = np.empty_like(theirs)
+        slack, other = np.empty_like(ours), np.empty_like(theirs)
+        np.subtract(ours[..., 1, :] + allowed, moved[..., 0, :], out=slack[..., 0, :])
+        np.subtract(moved[..., 1, :] + allowed, ours[..., 0, :], out=slack[..., 1, :])
         other[:, :, :m] = slack[..., ::-1, :].transpose(0, 2, 4, 3, 1)
         other[:, :, m:, 0] = theirs[:, :, m:, 1] - self.labels + allowed
         other[:, :, m:, 1] = self.labels - theirs[:, :, m:, 0] + allowed
-        is_empty = (other < 0.0).any(axis=(1, 2, 3, 4))
-        room = self.target.least(other.reshape(count, -1, 2 * n)).reshape(count, m, 2, n).transpose(0, 3, 2, 1)
-        room = np.minimum(room, self.source.least(slack.reshape(count, -1, 2 * m)).reshape(bounds.shape))
-        low, high = bounds[:, :, 0], bounds[:, :, 1]
+        return slack.reshape(count, -1, 2, m), other.reshape(count, -1, 2, n)
+
+    def shrink(self, slack: np.ndarray, other: np.ndarray) -> Bool[np.ndarray, " P"]:
+        """Cuts off, in place, what slacks rule out; which boxes are empty then, rounding included."""
+        low, high = self.bounds[:, :, 0], self.bounds[:, :, 1]
+        m = low.shape[2]
+        room = np.minimum(self.source.least(slack), self.target.least(other).transpose(0, 3, 2, 1))
         new_low = np.maximum(low, high - room[:, :, 0] - 4.0 * _EPS)
         new_high = np.minimum(high, low + room[:, :, 1] + 4.0 * _EPS)
-        sums, noise = (new_low.sum(axis=2), new_high.sum(axis=2)), 4.0 * m * m * _EPS
-        is_empty |= (self.is_row & ((sums[0] > 1.0 + noise) | (sums[1] < 1.0 - noise))).any(axis=1)
-        is_empty |= (new_low > new_high + noise).any(axis=(1, 2))
-        np.maximum(new_low, np.where(self.is_row, 1.0 - sums[1] - noise, 0.0)[:, :, None] + new_high, out=low)
-        np.minimum(new_high, np.where(self.is_row, 1.0 - sums[0] + noise, 0.0)[:, :, None] + new_low, out=high)
-        return is_empty
+        noise = 4.0 * m * m * _EPS
+        lacks = np.where(self.is_row, 1.0 - new_high.sum(axis=2) - noise, 0.0)
+        has_left = np.where(self.is_row, 1.0 - new_low.sum(axis=2) + noise, 0.0)
+        np.maximum(new_low, lacks[:, :, None] + new_high, out=low)
+        np.minimum(new_high, has_left[:, :, None] + new_low, out=high)
+        return (lacks > 0.0).any(axis=1) | (has_left < 0.0).any(axis=1) | (new_low > new_high).any(axis=(1, 2))
 
     def maps_inside(self) -> Float[np.ndarray, "P n m"]:
         """Those that are at the same part of the way from L to U everywhere in a row."""

@@ -266,7 +266,7 @@ def test_chunks_of_pairs(monkeypatch):
     bracket_errors = class_pairs.bracket_errors
 
     def recorded(source, target, **options):
-        calls.append(len(source))
+        calls.append(len(options["pairs"]))
         return bracket_errors(source, target, **options)
 
     monkeypatch.setattr(class_pairs, "_CHUNK_BYTES", 5000)

@@ -16,17 +16,19 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import ByHomomorphism
-from jaxhom.generalization.result import Generalization, extend, may_vote, votes_around
+from jaxhom.generalization.result import Generalization, extend
 from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.generalization.votes import policies_that_count
+from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.given_table import table_for
+from jaxhom.similarity.relations import UserRelation
 from jaxhom.similarity.table import SimilarityTable
-from jaxhom.status import Status
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, ArrayLike, Bool
+    from jaxtyping import Array, ArrayLike, Bool, Num
 
 
 @checks.eager_where_concrete
@@ -38,6 +40,12 @@ def soft_local_homomorphism(
     threshold: float = 0.0,
     anchored: bool = True,
     mutual: bool = False,
+    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
+    label_weight: float = 1.0,
+    relation: str | UserRelation = "homomorphism",
+    voters: str | int = "nearest",
+    weights: str = "equal",
+    temperature: float = 0.1,
     tolerance: float = 1e-4,
     states: Bool[ArrayLike, " S"] | None = None,
     table: SimilarityTable | None = None,
@@ -54,6 +62,17 @@ def soft_local_homomorphism(
       anchored: require that the centre is mapped to the centre. False is the relation as printed, which on models
         whose local models have absorbing states accepts nearly every pair.
       mutual: require the error of both directions to be within the threshold.
+      labels: [S, A, L], or [S, L] for labels of the state: what local models are told apart by besides transitions,
+        such as a reward [S, A], `mdp.features`, or how far an action is from the shortest way. See `SimilarityTable`.
+      label_weight: what labels are multiplied by.
+      relation: what the error of a pair is: "homomorphism", that of LP (9); "isomorphic", "weisfeiler_lehman",
+        "random_walk", "lax", or a function of two local models. See `SimilarityTable`.
+      voters: "nearest": those of Algorithm 1, all similar ones at the first distance at which there is one; a number k:
+        at the first distance within which there are k, or of all that are reached; "all": all similar ones, also those
+        that are not reached, whose models only look alike (`disjoint_union`).
+      weights: "equal"; or "similarity": a vote counts exp(-e / temperature) for the upper bound e on its error, which
+        is certified to the tolerance.
+      temperature: of these weights.
       tolerance: an error up to threshold + tolerance may count as similar; see `locally_similar`.
       states: bool [S], the states to find a policy for; the others stay uniform. All if None. Leaving out states in
         which the action does not matter, and which lead to many, saves their large local models.
@@ -64,8 +83,9 @@ def soft_local_homomorphism(
       similarity: the former name of `table`, which warns.
 
     Returns:
-      `Generalization`; `radius` is the t at which the algorithm stopped. Pairs of states whose error could not be told
-      from the threshold count as different: `undecided` says how many of a state's, and `status` why.
+      `Generalization`; `radius` is the t at which the last voter was found, 1 for voters="all". Pairs of states whose
+      error could not be told from the threshold count as different: `undecided` says how many of a state's, and
+      `status` why.
 
     Raises:
       ValueError: if a demonstration does not fit the model, an option is out of range or traced, or `table` is
@@ -88,14 +108,17 @@ def soft_local_homomorphism(
       >>> learn(demonstrations).reshape(8, 8)[1].tolist()
       [-1, 0, 0, 0, 1, 2, 3, -1]
 
-    Source: Boularias and Chaib-draa 2010, Algorithm 1; anchoring and `mutual` are additions.
+    Source: Boularias and Chaib-draa 2010, Algorithm 1; anchoring, `mutual`, labels, relations other than LP (9), voters
+    and weights are additions.
     """
     if similarity is not None:
         warnings.warn("similarity is now called table", DeprecationWarning, stacklevel=3)
         if table is not None:
             raise ValueError("similarity is the former name of table: give one of them")
         table = similarity
-    checks.refuse_traced(distance=distance, threshold=threshold, anchored=anchored, mutual=mutual, tolerance=tolerance)
+    checks.refuse_traced(distance=distance, anchored=anchored, labels=labels, label_weight=label_weight)
+    checks.refuse_traced(mutual=mutual)
+    rule = VotingRule(threshold, bool(mutual), tolerance, voters, weights, temperature)
     mdp = as_model(mdp)
     is_traced = checks.is_traced(mdp, demonstrations, states)
     if is_traced and table is None:
@@ -103,40 +126,31 @@ def soft_local_homomorphism(
             "table is needed where something is traced: solve all pairs of classes outside jit, vmap and grad with "
             "SimilarityTable(mdp, ...).complete(threshold), and close over it"
         )
-    table = table_for(table, mdp, distance, anchored)
-    relation = {"threshold": threshold, "mutual": mutual, "tolerance": tolerance}
+    kind = {"distance": distance, "anchored": anchored, "labels": labels, "label_weight": label_weight}
+    table = table_for(table, mdp, relation=relation, **kind)
     start = uniform_elsewhere(mdp, demonstrations)
     if is_traced:
         asking = ~start.visited & _asked(mdp, states)
         experts = votes_in_program.padded_experts(mdp, demonstrations, start.visited)
-        found = votes_in_program.vote_of_rings(mdp, start, experts, asking, table.relation(**relation))
+        found = votes_in_program.vote_by_rule(mdp, start, experts, asking, table, rule)
         return extend(mdp, start, found.votes, None, undecided=found.undecided, status=found.status)
     asking = ~np.asarray(start.visited) & _asked(mdp, states)
-    votes, ended = _vote_on_host(mdp, start, asking, table, relation, progress)
-    return extend(mdp, start, votes, ByHomomorphism(mdp, table, asking, **relation), **ended)
+    votes, ended = _vote_on_host(mdp, start, asking, table, rule, progress)
+    return extend(mdp, start, votes, ByHomomorphism(mdp, table, asking, rule), **ended)
 
 
-def _vote_on_host(mdp: MDP, start: Generalization, asking: np.ndarray, table: SimilarityTable, relation, progress):
+def _vote_on_host(mdp: MDP, start: Generalization, asking: np.ndarray, table: SimilarityTable, rule, progress):
     """The votes around the states that ask, bool [S], and `undecided` and `status`; solves the pairs that it meets."""
+    visited, policy = np.asarray(start.visited), np.asarray(start.policy)
     # All classes that will be met, at once: programs are as wide as the widest class that is known.
-    table.classes(np.flatnonzero(asking | evidence.deciding(mdp, start.visited)))
-    can_vote, status = may_vote(mdp, start), Status.SOLVED
-    undecided = np.zeros(mdp.num_states, np.int32)
-
-    def accept(state, expert):
-        nonlocal status
-        accepted = can_vote(state, expert)
-        state, expert = state[accepted], expert[accepted]
-        found = table.decisions(state, expert, **relation, progress=progress)
-        accepted[accepted] = found.similar
-        np.add.at(undecided, state, found.status != Status.SOLVED)
-        status = max(status, found.status.max(initial=Status.SOLVED))
-        return accepted
-
-    votes = votes_around(mdp, start, accept, asking)
+    met = asking | evidence.deciding(mdp, visited)
+    group = np.zeros(mdp.num_states, np.int32)
+    group[met] = table.classes(np.flatnonzero(met))
+    ballots = HostBallots(mdp, table, rule, policies_that_count(mdp, visited, policy), progress)
+    votes = ballots.elect(visited, policy, asking, group)
     ended = {
-        "undecided": checks.to_device(undecided, jnp.int32),
-        "status": checks.to_device(np.asarray(status), jnp.int32),
+        "undecided": checks.to_device(ballots.undecided, jnp.int32),
+        "status": checks.to_device(np.asarray(ballots.status), jnp.int32),
     }
     return votes, ended
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxhom.generalization import evidence
 from jaxhom.generalization.explanation import Explanation
-from jaxhom.generalization.votes import is_nearest, square_distances
+from jaxhom.generalization.votes import is_nearest, policies_that_count, square_distances
+from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.graph import steps_from
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.table import SimilarityTable
@@ -36,9 +37,7 @@ class ByHomomorphism:
     mdp: MDP
     table: SimilarityTable
     asking: np.ndarray
-    threshold: float
-    mutual: bool
-    tolerance: float
+    rule: VotingRule
 
     def __call__(self, general: Generalized, state: int) -> Explanation:
         if not self.asking[state]:
@@ -48,23 +47,45 @@ class ByHomomorphism:
         if radius < 0:
             why = _met(self.mdp, general, state, steps, ", none locally similar")
             return _uniform(general, state, self._method(), why, _undecided(general, state))
-        # Those nearer were refused when their ring was reached, or the search would have ended there.
-        candidates = _experts(self.mdp, general, state)
-        candidates = candidates[steps[candidates] == radius]
-        options = {"threshold": self.threshold, "mutual": self.mutual, "tolerance": self.tolerance}
-        voters = candidates[self.table.decide(np.full(len(candidates), state), candidates, **options)]
+        candidates, votes = self._voters(general, state, steps, radius)
+        voters, votes = candidates[votes.any(axis=1)], votes[votes.any(axis=1)]
         here = np.full(len(voters), state)
-        reason = f"{_voted(voters)}, {_steps(radius)} away.{_undecided(general, state)}"
+        where = "wherever they are" if self.rule.least_voters is None else self._where(steps[voters])
+        reason = f"{_voted(voters)}, {where}.{_undecided(general, state)}"
+        table = self.table
         return dataclasses.replace(
-            _mean_of(general, state, self._method(), reason, voters, steps[voters], mdp=self.mdp),
-            forward=self.table.maps(here, voters),
-            backward=self.table.maps(voters, here) if self.mutual else None,
+            _mean_of(general, state, self._method(), reason, voters, steps[voters], votes, self.mdp),
+            forward=table.maps(here, voters) if table.has_maps else None,
+            backward=table.maps(voters, here) if table.has_maps and self.rule.mutual else None,
+            errors=None if table.has_maps else table.brackets(here, voters),
+            renamings=table.renamings(here, voters),
         )
 
+    def _voters(self, general: Generalized, state: int, steps: np.ndarray, radius: int):
+        """Demonstrated states, and their votes [E, A] as they were counted."""
+        candidates = np.flatnonzero(np.asarray(general.visited))
+        if self.rule.least_voters is not None:
+            candidates = candidates[steps[candidates] <= radius]
+        policies = policies_that_count(self.mdp, np.asarray(general.visited), np.asarray(general.policy))
+        ballots = HostBallots(self.mdp, self.table, self.rule, policies)
+        return candidates, ballots(np.full(len(candidates), state), candidates)
+
+    def _where(self, steps: np.ndarray) -> str:
+        nearest, farthest = int(steps.min()), int(steps.max())
+        return f"{_steps(farthest)} away" if nearest == farthest else f"{nearest} to {_steps(farthest)} away"
+
     def _method(self) -> str:
-        kind = "anchored" if self.table.anchored else "as printed"
-        both = ", both directions" if self.mutual else ""
-        return f"Algorithm 1 (d = {self.table.distance}, epsilon = {self.threshold:g}, {kind}{both})"
+        table, rule = self.table, self.rule
+        parts = [
+            f"d = {table.distance}",
+            f"epsilon = {rule.threshold:g}",
+            "anchored" if table.anchored else "as printed",
+        ]
+        parts += ["both directions"] * rule.mutual + [f"{table.compares} models"] * (table.compares != "homomorphism")
+        parts += [] if table.labels is None else [f"{table.labels.shape[2]} labels"]
+        parts += [] if rule.voters == "nearest" else [f"voters: {rule.voters}"]
+        parts += [f"weights exp(-e / {rule.temperature:g})"] * rule.is_weighted
+        return f"Algorithm 1 ({', '.join(parts)})"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -128,7 +149,8 @@ class ByGlobalMap:
         others = f", {rest:.2g} of it to others" if rest else ""
         reason = f"the map sends it to {_states(len(voters))}{others}."
         distances = steps_from(self.mdp, state)[voters]
-        return _mean_of(general, state, method, reason, voters, distances, shares[chosen], mdp=self.mdp)
+        votes = evidence.allowed_part(self.mdp, np.full(len(voters), state), np.asarray(general.policy)[voters])
+        return _mean_of(general, state, method, reason, voters, distances, shares[chosen][:, None] * votes, self.mdp)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -167,17 +189,16 @@ def _experts(mdp: MDP, general: Generalized, state: int) -> np.ndarray:
     return experts[evidence.has_vote(mdp, general.policy, np.full(len(experts), state), experts)]
 
 
-def _mean_of(general, state: int, method: str, reason: str, voters=(), distances=(), weights=None, mdp=None):
-    """The mean of the voters' policies, alike if `weights` is None; of what they say that `mdp` allows in the state."""
+def _mean_of(general, state: int, method: str, reason: str, voters=(), distances=(), votes=None, mdp=None):
+    """The mean of the voters' policies, weighted by votes [E, A]; all alike, of what `mdp` allows, if None."""
     voters = np.asarray(voters, int)
-    weights = np.full(len(voters), 1.0) / max(len(voters), 1) if weights is None else weights
     policies = np.asarray(general.policy)[voters]
-    if mdp is not None and mdp.restricts_actions and len(voters):
-        policies = evidence.allowed_part(mdp, np.full(len(voters), state), policies)
-        counted = policies.sum(axis=1)
-        policies = policies / np.where(counted > 0, counted, 1.0)[:, None]
-        weights = weights * counted / (weights @ counted)
-        reason += " Votes for actions that it lacks do not count." * bool((counted < 1.0 - 1e-9).any())
+    if votes is None:
+        is_restricted = mdp is not None and mdp.restricts_actions and len(voters)
+        votes = evidence.allowed_part(mdp, np.full(len(voters), state), policies) if is_restricted else policies
+    counted = votes.sum(axis=1)
+    if mdp is not None and mdp.restricts_actions and (~np.asarray(mdp.allowed)[state] & (policies > 0)).any():
+        reason += " Votes for actions that it lacks do not count."
     return Explanation(
         state=state,
         method=method,
@@ -185,8 +206,8 @@ def _mean_of(general, state: int, method: str, reason: str, voters=(), distances
         radius=int(general.radius[state]),
         policy=np.asarray(general.policy[state]),
         voters=voters,
-        weights=weights,
-        voter_policies=policies,
+        weights=counted / max(counted.sum(), np.finfo(float).tiny),
+        voter_policies=votes / np.where(counted > 0, counted, 1.0)[:, None],
         distances=np.asarray(distances, float),
     )
 

@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxhom.similarity.brackets import LocalSimilarity
 from jaxhom.similarity.maps import CertifiedMaps
 from jaxhom.status import Record, Status, bracket
 
@@ -34,6 +35,9 @@ class Explanation(Record):
       forward: the map f of LP (9) from the state's local model (the source s) to that of each voter (the target s'),
         with certified bounds on the optimal error; None where the method compares no models.
       backward: if similarity had to be mutual, the maps from the voters' models to the state's.
+      errors: bounds on the error to each voter, [E], where models are compared without a map; None otherwise.
+      renamings: int [E, A], which of the voter's actions stands for each action of the state, where they were renamed;
+        `forward` then is the map to the renamed model. None where every action stands for itself.
     """
 
     state: int = dataclasses.field(metadata={"static": True})
@@ -47,16 +51,22 @@ class Explanation(Record):
     distances: np.ndarray
     forward: CertifiedMaps | None = None
     backward: CertifiedMaps | None = None
+    errors: LocalSimilarity | None = None
+    renamings: np.ndarray | None = None
 
     @property
     def lower(self) -> np.ndarray | None:
-        """[E], lower <= e <= upper for the error e of the map to each voter; None as `forward`."""
-        return None if self.forward is None else self.forward.lower
+        """[E], lower <= e <= upper for the error e to each voter; None where the method compares no models."""
+        return None if self._bounds is None else self._bounds.lower
 
     @property
     def upper(self) -> np.ndarray | None:
         """[E], see `lower`."""
-        return None if self.forward is None else self.forward.upper
+        return None if self._bounds is None else self._bounds.upper
+
+    @property
+    def _bounds(self) -> CertifiedMaps | LocalSimilarity | None:
+        return self.errors if self.forward is None else self.forward
 
     @property
     def maps(self) -> np.ndarray | None:
@@ -80,8 +90,11 @@ class Explanation(Record):
             "share": [f"{self.weights[e]:.4g}" for e in order],
             "its policy": [_numbers(self.voter_policies[e]) for e in order],
         }
-        if self.forward is not None:
-            columns["error e of its map"] = [_bracket(self.forward, e) for e in order]
+        if self._bounds is not None:
+            of = "error e" if self.forward is None else "error e of its map"
+            columns[of] = [_bracket(self._bounds, e) for e in order]
+        if self.renamings is not None:
+            columns["its actions renamed"] = [_renaming(self.renamings[e]) for e in order]
         if self.backward is not None:
             columns["and of the map back"] = [_bracket(self.backward, e) for e in order]
         width = {name: max(map(len, [name, *cells])) for name, cells in columns.items()}
@@ -103,7 +116,12 @@ def _numbers(row: np.ndarray) -> str:
     return np.array2string(row, formatter={"float": lambda x: f"{x:.3g}"}, threshold=12, separator=", ")
 
 
-def _bracket(found: CertifiedMaps, pair: int) -> str:
+def _renaming(order: np.ndarray) -> str:
+    """`2 -> 0, 0 -> 2`: which of the voter's actions become which; none that keep their names."""
+    return ", ".join(f"{its} -> {own}" for own, its in enumerate(order) if its != own) or "none"
+
+
+def _bracket(found: CertifiedMaps | LocalSimilarity, pair: int) -> str:
     mark = "" if found.status[pair] == Status.SOLVED else " (stopped early)"
     return bracket(found.lower[pair], found.upper[pair]) + mark
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -10,9 +11,9 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import ByCoordinates, ByHops
-from jaxhom.generalization.result import Generalization, extend, may_vote, votes_around
+from jaxhom.generalization.result import Generalization, extend
 from jaxhom.generalization.uniform import uniform_elsewhere
-from jaxhom.generalization.votes import Votes, vote_of_nearest
+from jaxhom.generalization.votes import Votes, plain_ballots, vote_of_nearest, vote_of_rings
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model, check_coordinates
 from jaxhom.models.mdp import MDP
@@ -73,16 +74,17 @@ def nearest_neighbors(
     start = uniform_elsewhere(mdp, demonstrations)
     if checks.is_traced(mdp, demonstrations, coordinates):
         return extend(mdp, start, _votes_in_program(mdp, demonstrations, start, coordinates), None)
+    visited, policy = np.asarray(start.visited), np.asarray(start.policy)
     if coordinates is None:
-        votes = votes_around(mdp, start, may_vote(mdp, start), ~np.asarray(start.visited))
+        votes = vote_of_rings(mdp, visited, policy, ~visited, plain_ballots(mdp, visited, policy))
         return extend(mdp, start, votes, ByHops(mdp))
-    accept = may_vote(mdp, start) if mdp.restricts_actions else None
-    votes = vote_of_nearest(evidence.deciding(mdp, start.visited), np.asarray(start.policy), coordinates, accept)
+    accept = functools.partial(evidence.has_vote, mdp, policy) if mdp.restricts_actions else None
+    votes = vote_of_nearest(evidence.deciding(mdp, visited), policy, coordinates, accept)
     return extend(mdp, start, votes, ByCoordinates(mdp, coordinates))
 
 
 def _votes_in_program(mdp: MDP, demonstrations: Demonstrations, start: Generalization, coordinates) -> Votes:
     experts = votes_in_program.padded_experts(mdp, demonstrations, start.visited)
     if coordinates is None:
-        return votes_in_program.vote_of_rings(mdp, start, experts, ~start.visited).votes
+        return votes_in_program.vote_of_rings(mdp, start, experts, ~start.visited)
     return votes_in_program.vote_of_nearest(mdp, start, experts, jnp.asarray(coordinates, float))

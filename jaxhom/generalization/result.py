@@ -6,13 +6,11 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from jaxhom import checks
 from jaxhom.generalization import evidence
 from jaxhom.generalization.explainers import demonstrated
 from jaxhom.generalization.explanation import Explanation
-from jaxhom.generalization.votes import Votes, vote_of_rings
+from jaxhom.generalization.votes import Votes
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
@@ -105,14 +103,3 @@ def extend(mdp: MDP, start: Generalization, votes: Votes, explainer, **more) -> 
         explainer=explainer,
         **more,
     )
-
-
-def may_vote(mdp: MDP, start: Generalization) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Decides pairs (states [P], demonstrated states [P]): whether the second may vote in the first at all."""
-    decides, policy = evidence.deciding(mdp, start.visited), np.asarray(start.policy)
-    return lambda state, expert: decides[expert] & evidence.has_vote(mdp, policy, state, expert)
-
-
-def votes_around(mdp: MDP, start: Generalization, accept, asking: np.ndarray) -> Votes:
-    """The votes of the nearest accepted states around those that ask, bool [S], none of them demonstrated."""
-    return vote_of_rings(mdp, np.asarray(start.visited), np.asarray(start.policy), asking, accept)

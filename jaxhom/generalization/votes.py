@@ -1,8 +1,8 @@
 """Who votes: the demonstrated states that Algorithm 1 and k-NN find around every other state.
 
 Algorithm 1 of Boularias and Chaib-draa 2010 grows the set s^t of states within t steps of an unvisited state s; at
-the first t at which s^t holds demonstrated states that are accepted, these vote. k-NN by steps accepts them all, k-NN
-by Euclidean distance takes the nearest. On the host; `votes_in_program` does the same where something is traced.
+the first t at which s^t holds demonstrated states that have a vote there, these vote. In k-NN by steps all have one,
+k-NN by Euclidean distance takes the nearest. On the host; `votes_in_program` does the same where something is traced.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,10 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxhom.generalization import evidence
 from jaxhom.models.graph import reachable_within
 from jaxhom.models.mdp import MDP
 
 _CHUNK_BYTES = 64 * 2**20  # of distances at a time
+Ballots = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""The votes [P, A] of demonstrated states [P] in states [P]; zero where one has none."""
 TIE = 1e-9  # relative difference of two distances that rounding may have made
 
 
@@ -25,33 +28,75 @@ class Votes(NamedTuple):
     support: np.ndarray
 
 
-def vote_of_rings(mdp: MDP, visited, policy, asking, accept: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Votes:
-    """Grows s^t for every s that asks until a demonstrated state in it is accepted; the accepted ones vote.
+def policies_that_count(mdp: MDP, visited, policy) -> Ballots:
+    """The expert's `policy` [S, A] in the demonstrated states that decide, whoever asks."""
+    rows = np.where(evidence.deciding(mdp, visited)[:, None], policy, 0.0)
+    return lambda states, experts: rows[experts]
+
+
+def plain_ballots(mdp: MDP, visited, policy) -> Ballots:
+    """The same, as far as the states that ask have the actions: all demonstrated states that have a vote."""
+    policies = policies_that_count(mdp, visited, policy)
+    return lambda states, experts: evidence.allowed_part(mdp, states, policies(states, experts))
+
+
+def vote_of_rings(mdp: MDP, visited, policy, asking, ballots: Ballots, least: int = 1) -> Votes:
+    """Grows s^t for every s that asks until demonstrated states in it have votes; all of these in it vote.
 
     Args:
       mdp: the model.
       visited: bool [S], the demonstrated states.
-      policy: [S, A], the expert's frequencies on them, and what states keep for which nothing is found.
-      asking: bool [S], the states to ask for, none of them demonstrated.
-      accept: decides pairs (states [P], demonstrated states [P]) and is asked once about every pair that a ring
-        brings together.
+      policy: [S, A], what states keep for which nothing is found.
+      asking: bool [S], the states to ask for.
+      ballots: the votes [P, A] of demonstrated states [P] in states [P]; asked once about every pair that a ring brings
+        together.
+      least: grow s^t until it holds so many voters, or does not grow any more.
     """
     found = _no_votes(visited, policy)
     experts, waiting = np.flatnonzero(visited), np.flatnonzero(asking)
+    total, voters, radius = np.zeros(np.shape(policy)), np.zeros(len(policy), int), np.full(len(policy), -1)
     for t, ring in enumerate(_rings(mdp, experts), start=1):
         row, column = np.nonzero(ring[waiting])
-        accepted = accept(waiting[row], experts[column])
-        row, column = row[accepted], column[accepted]
-        votes = np.zeros((len(waiting), mdp.num_actions), policy.dtype)
-        np.add.at(votes, row, policy[experts[column]])
-        voters = np.bincount(row, minlength=len(waiting))
-        is_found = voters > 0
-        states = waiting[is_found]
-        found.policy[states] = votes[is_found] / votes[is_found].sum(axis=1, keepdims=True)
-        found.radius[states], found.support[states] = t, voters[is_found]
-        waiting = waiting[~is_found]
+        states = waiting[row]
+        votes = ballots(states, experts[column])
+        counts = votes.any(axis=1)
+        np.add.at(total, states[counts], votes[counts])
+        np.add.at(voters, states[counts], 1)
+        radius[states[counts]] = t
+        waiting = waiting[voters[waiting] < least]
         if not waiting.size:
             break
+    return _elected(found, total, voters, radius)
+
+
+def vote_of_all(visited, policy, asking, ballots: Ballots, group: np.ndarray | None = None) -> Votes:
+    """All demonstrated states that have votes vote, wherever they are; the radius is 1.
+
+    Args:
+      visited, policy, asking, ballots: as in `vote_of_rings`.
+      group: int [S], the same for states for which all ballots are the same; asked once for each.
+    """
+    found = _no_votes(visited, policy)
+    experts, states = np.flatnonzero(visited), np.flatnonzero(asking)
+    _, first, where = np.unique((states if group is None else group[states]), return_index=True, return_inverse=True)
+    different, num_actions = states[first], np.shape(policy)[1]
+    total, voters = np.zeros((len(different), num_actions)), np.zeros(len(different), int)
+    most = max(1, _CHUNK_BYTES // (8 * num_actions * max(len(experts), 1)))
+    for part in np.split(np.arange(len(different)), range(most, len(different), most)):
+        votes = ballots(np.repeat(different[part], len(experts)), np.tile(experts, len(part)))
+        votes = votes.reshape(len(part), len(experts), num_actions)
+        total[part], voters[part] = votes.sum(axis=1), votes.any(axis=2).sum(axis=1)
+    everywhere = np.zeros(np.shape(policy)), np.zeros(len(policy), int)
+    for place, numbers in zip(everywhere, (total, voters), strict=True):
+        place[states] = numbers[where]
+    return _elected(found, *everywhere, np.ones(len(policy), int))
+
+
+def _elected(found: Votes, total, voters, radius) -> Votes:
+    """The votes `found` with those of the states that got any; `total` [S, A], the rest [S]."""
+    is_found = voters > 0
+    found.policy[is_found] = total[is_found] / total[is_found].sum(axis=1, keepdims=True)
+    found.radius[is_found], found.support[is_found] = radius[is_found], voters[is_found]
     return found
 
 

@@ -20,11 +20,13 @@ from jaxhom import checks
 from jaxhom.generalization import evidence
 from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.votes import TIE, Votes, is_nearest, square_distances
+from jaxhom.generalization.voting import VotingRule
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.graph import host_graph
 from jaxhom.models.mdp import MDP
 from jaxhom.models.padded_rows import narrow_width
 from jaxhom.similarity.decisions import Relation
+from jaxhom.similarity.table import SimilarityTable
 from jaxhom.status import Status
 
 _UNROLL = 2  # successors whose sets are united in one pass; XLA repeats a union without a loop in all that reads it
@@ -44,9 +46,9 @@ class _Search(NamedTuple):
     Attributes:
       within: who lies within t steps.
       asked: who lay within as many steps as the state has waited.
-      voters: who votes; empty while the state waits.
-      is_waiting: whether a state asks and nobody was accepted yet.
-      radius: for how many steps it has waited.
+      voters: who votes.
+      is_waiting: whether a state asks and has not enough voters yet.
+      radius: after how many steps the last of them joined; -1 where none did.
     """
 
     steps: jax.Array
@@ -65,32 +67,83 @@ def padded_experts(mdp: MDP, demonstrations: Demonstrations, visited) -> jax.Arr
     return jnp.nonzero(decides, size=length, fill_value=mdp.num_states)[0].astype(jnp.int32)
 
 
-def vote_of_rings(mdp: MDP, start: Generalization, experts, asking, relation: Relation | None = None) -> Found:
-    """As `votes.vote_of_rings`: the nearest demonstrated states that may vote and are similar; all that may if None.
+def vote_of_rings(mdp: MDP, start: Generalization, experts, asking) -> Votes:
+    """As `votes.vote_of_rings` with `votes.plain_ballots`: the nearest demonstrated states that may vote.
 
     Args:
       mdp: the model.
       start: the demonstrated states and the expert's policy.
       experts: from `padded_experts`.
       asking: bool [S], the states to ask for, none of them demonstrated.
-      relation: which classes are similar; concrete.
     """
-    may_vote = _may_vote(mdp, start, experts)
-    accepted = may_vote if relation is None else may_vote & _by_class(relation, relation.similar, experts)
-    search = _grow(mdp, experts, accepted, asking)
-    is_voter = _unpacked(search.voters, len(experts))
-    votes = Votes(
-        policy=evidence.policy_of_votes(mdp, sum_of_policies(is_voter, start.policy, experts))[0],
-        radius=jnp.where(search.is_waiting, -1, search.radius),
-        support=_count(search.voters),
-    )
+    search = _grow(mdp, experts, _may_vote(mdp, start, experts), asking, least=1)
+    return _elected(mdp, search, sum_of_policies(_unpacked(search.voters, len(experts)), start.policy, experts))
+
+
+def vote_by_rule(mdp: MDP, start: Generalization, experts, asking, table: SimilarityTable, rule: VotingRule) -> Found:
+    """As `voting.HostBallots.elect`, where the table is complete for the rule."""
+    relation = table.relation(**rule.of_table, with_errors=rule.is_weighted)
+    ballots = _Ballots(mdp, start.policy, experts, relation, rule)
+    may_vote = _may_vote(mdp, start, experts) if relation.renaming is None else ballots.has_vote()
+    accepted = may_vote & _by_class(relation, relation.similar, experts)
+    if rule.least_voters is None:
+        search = _everybody(mdp, experts, accepted, asking)
+    else:
+        search = _grow(mdp, experts, accepted, asking, rule.least_voters)
+    votes = _elected(mdp, search, ballots.total(_unpacked(search.voters, len(experts))))
     undecided, status = jnp.zeros(mdp.num_states, jnp.int32), jnp.asarray(Status.SOLVED, jnp.int32)
-    if relation is not None:
-        for reason in (Status.ITERATION_LIMIT, Status.STALLED):
-            count = _count(search.asked & may_vote & _by_class(relation, relation.status == reason, experts))
-            undecided += count
-            status = jnp.where(count.any(), jnp.int32(reason), status)
+    for reason in (Status.ITERATION_LIMIT, Status.STALLED):
+        count = _count(search.asked & may_vote & _by_class(relation, relation.status == reason, experts))
+        undecided += count
+        status = jnp.where(count.any(), jnp.int32(reason), status)
     return Found(votes, undecided, status)
+
+
+class _Ballots(NamedTuple):
+    """What demonstrated states say to all states; the votes of one are [S, A]."""
+
+    mdp: MDP
+    policy: jax.Array
+    experts: jax.Array
+    relation: Relation
+    rule: VotingRule
+
+    def has_vote(self) -> jax.Array:
+        """Words [S, W]: the demonstrated states of whose renamed votes some are for actions that the state has."""
+        return _packed(jax.lax.map(lambda expert: self._renamed(expert).any(axis=1), self.experts).T)
+
+    def total(self, is_voter) -> jax.Array:
+        """[S, A]: the sum of the votes of voters [S, E]."""
+        label, weights = jnp.asarray(self.relation.label), is_voter.astype(self.policy.dtype)
+        if self.relation.error is not None:
+            weight = jnp.asarray(self.rule.weight(self.relation.error), self.policy.dtype)
+            weights *= weight[:, label.at[self.experts].get(mode="clip")][label]
+        if self.relation.renaming is None:
+            return sum_of_policies(weights, self.policy, self.experts)
+
+        def add(total, one):
+            expert, weight = one
+            return total + weight[:, None] * self._renamed(expert), None
+
+        total, _ = jax.lax.scan(add, jnp.zeros_like(self.policy), (self.experts, weights.T))
+        return total
+
+    def _renamed(self, expert) -> jax.Array:
+        """[S, A]: the votes of one demonstrated state, its actions renamed; 0 for a place that is padding."""
+        label = jnp.asarray(self.relation.label)
+        order = jnp.asarray(self.relation.renaming)[label, label.at[expert].get(mode="clip")]
+        votes = self.policy.at[expert].get(mode="fill", fill_value=0)[order]
+        return evidence.allowed_part(self.mdp, slice(None), votes)
+
+
+def _elected(mdp: MDP, search: _Search, total) -> Votes:
+    """What a search found, and the sum [S, A] of the votes of its voters."""
+    support = _count(search.voters)
+    return Votes(
+        policy=evidence.policy_of_votes(mdp, total)[0],
+        radius=jnp.where(support > 0, search.radius, -1),
+        support=support,
+    )
 
 
 def vote_of_nearest(mdp: MDP, start: Generalization, experts, coordinates) -> Votes:
@@ -122,15 +175,16 @@ def _rounding(coordinates, least) -> jax.Array:
     return 4 * (limits.eps + difference / jnp.sqrt(jnp.maximum(least, limits.tiny)))
 
 
-def _grow(mdp: MDP, experts, accepted, asking) -> _Search:
-    """Grows the sets until no state waits or no set grows, which is after S steps at the latest."""
+def _grow(mdp: MDP, experts, accepted, asking, least: int) -> _Search:
+    """Grows the sets until no state waits for `least` voters or no set grows, after S steps at the latest."""
     successors = _successors(mdp)
 
     def step(search: _Search) -> _Search:
         grown = _united(search.within, successors)
         waits = search.is_waiting[:, None]
-        voters = jnp.where(waits, grown & ~search.within & accepted, search.voters)
-        is_waiting = search.is_waiting & ~(voters > 0).any(axis=1)
+        joined = jnp.where(waits, grown & ~search.within & accepted, 0)
+        voters = search.voters | joined
+        is_waiting = search.is_waiting & (_count(voters) < least)
         return _Search(
             steps=search.steps + 1,
             is_growing=(grown != search.within).any() & is_waiting.any(),
@@ -138,7 +192,7 @@ def _grow(mdp: MDP, experts, accepted, asking) -> _Search:
             asked=jnp.where(waits, grown, search.asked),
             voters=voters,
             is_waiting=is_waiting,
-            radius=search.radius + search.is_waiting,
+            radius=jnp.where((joined > 0).any(axis=1), search.steps + 1, search.radius),
         )
 
     within = _packed(jnp.arange(mdp.num_states)[:, None] == experts)
@@ -149,9 +203,23 @@ def _grow(mdp: MDP, experts, accepted, asking) -> _Search:
         asked=within,
         voters=within & ~within,  # empty: sets of the states that ask are, at first
         is_waiting=asking,
-        radius=jnp.where(asking, 0, -1).astype(jnp.int32),
+        radius=jnp.where(asking, -1, -1).astype(jnp.int32),  # varies over what `asking` does
     )
     return jax.lax.while_loop(lambda search: search.is_growing & (search.steps < mdp.num_states), step, start)
+
+
+def _everybody(mdp: MDP, experts, accepted, asking) -> _Search:
+    """The end of a search that takes all, wherever they are."""
+    everyone = jnp.where(asking[:, None], _packed(jnp.broadcast_to(experts < mdp.num_states, (1, len(experts)))), 0)
+    return _Search(
+        steps=jnp.int32(0),
+        is_growing=jnp.asarray(False),
+        within=everyone,
+        asked=everyone,
+        voters=everyone & accepted,
+        is_waiting=asking,
+        radius=jnp.ones(mdp.num_states, jnp.int32),
+    )
 
 
 def _successors(mdp: MDP) -> list[tuple[jax.Array | np.ndarray, jax.Array | np.ndarray]]:

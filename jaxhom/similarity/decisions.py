@@ -18,10 +18,12 @@ class Decisions(Record):
     Attributes:
       similar: bool [P].
       status: int32 [P], a `jaxhom.Status`: SOLVED where the bounds decide, or else why they do not.
+      error: [P], upper bounds on the errors of similar pairs that are as close as asked for; None if not asked for.
     """
 
     similar: np.ndarray
     status: np.ndarray
+    error: np.ndarray | None = None
 
 
 class Relation(Record):
@@ -31,11 +33,16 @@ class Relation(Record):
       label: int32 [S], the class of each state.
       similar: bool [C, C]. Pairs that could not be decided count as different.
       status: int32 [C, C], a `jaxhom.Status`: SOLVED where the bounds decide, or else why they do not.
+      error: [C, C], as in `Decisions`; None if not asked for.
+      renaming: int [C, C, A], which action of the target stands for each of the source's, of similar pairs; None where
+        every action is itself.
     """
 
     label: np.ndarray
     similar: np.ndarray
     status: np.ndarray
+    error: np.ndarray | None = None
+    renaming: np.ndarray | None = None
 
     @property
     def undecided(self) -> np.ndarray:
@@ -79,11 +86,11 @@ def every_pair(num_classes: int) -> np.ndarray:
     return np.indices((num_classes,) * 2).reshape(2, -1).T
 
 
-def require_decided(is_open: np.ndarray, threshold: float, tolerance: float) -> None:
-    """Raises `ValueError` where pairs are still to be solved for a threshold."""
+def require_decided(is_open: np.ndarray, threshold: float, tolerance: float, how: str = "") -> None:
+    """Raises `ValueError` where pairs are still to be solved for a threshold; `how` a table has to be completed."""
     if is_open.any():
         raise ValueError(
             f"the table has not decided {int(is_open.sum())} of {len(is_open)} pairs of classes for threshold "
             f"{checks.in_one_line(threshold)} and tolerance {checks.in_one_line(tolerance)}: call "
-            f"table.complete(threshold={checks.in_one_line(threshold)}) first, outside jit, vmap and grad"
+            f"table.complete(threshold={checks.in_one_line(threshold)}{how}) first, outside jit, vmap and grad"
         )

@@ -21,10 +21,12 @@ def table_for(
     labels: Any = None,
     label_weight: Any = 1.0,
     relation: Any = "homomorphism",
+    for_graph: bool = False,
 ) -> SimilarityTable:
     """The table that was given, if it is one for this model and these options, or else `ValueError`; a new one if None.
 
-    Options that differ from a table's are refused rather than overruled.
+    Options that differ from a table's are refused rather than overruled; labels and relation do not count where the
+    table stands for the graph alone.
     """
     if table is None:
         options = {"labels": labels, "label_weight": label_weight, "relation": relation}
@@ -38,6 +40,8 @@ def table_for(
             f"table was made with distance={table.distance} and anchored={table.anchored}, "
             f"not with distance={distance} and anchored={anchored}"
         )
+    if for_graph:
+        return table
     if relation != table.given_relation:
         raise ValueError(
             f"table was made with relation={checks.in_one_line(table.given_relation)}, "

@@ -78,8 +78,8 @@ def local_similarity(
 
     Raises:
       ValueError: if a state is out of range, shapes or numbers of actions differ, labels do not fit, an option is
-        unknown, out of range or traced, or `table` is another's; on a traced graph without a table, on local models too large for a
-        program, and on a second derivative.
+        unknown, out of range or traced, or `table` is another's; on a traced graph without a table, on local models too
+        large for a program, and on a second derivative.
 
     Works under `jit`, `vmap`, `grad` and `jvp`. What has to be concrete there are options and the graph of the model:
     close over the model and trace its arrays by `mdp.replace(...)`; or give `table=SimilarityTable(mdp)`, whose graph
@@ -90,8 +90,8 @@ def local_similarity(
     There the bounds of float32 are not refined in float64, so large models may stay STALLED.
 
     `lower` and `upper` both have the envelope theorem's derivative in the probabilities, <y, (dT) f - f (dT')>, and in
-    the labels, <y, dl - f dl'>, at the best map f and dual point y that were found. Where the optimum is not unique, that is the slope of one piece, a
-    subgradient; it may be zero at e = 0.
+    the labels, <y, dl - f dl'>, at the best map f and dual point y that were found. Where the optimum is not unique,
+    that is the slope of one piece, a subgradient; it may be zero at e = 0.
 
     Example:
       >>> import jaxhom, numpy as np
@@ -236,7 +236,9 @@ class _Pairs(NamedTuple):
         if self.is_one:
             return table_for(table, source.mdp, labels=source.labels, **kind), source.states, target.states
         _refuse_table(table)
-        both = disjoint_union([side.mdp.replace(features=side.mdp.features[..., :0]) for side in (source, target)])
+        # Of one discount and without features, which local models do not depend on.
+        bare = {"discount": source.mdp.discount}
+        both = disjoint_union([side.mdp.replace(features=side.mdp.features[..., :0], **bare) for side in self[:2]])
         labels = None if source.labels is None else np.concatenate([source.labels, target.labels])
         states = (check_states(side.mdp, side.states, name) for side, name in zip(self[:2], _NAMES, strict=True))
         sources, targets = (own + first for own, first in zip(states, both.offsets.tolist(), strict=True))
@@ -248,7 +250,7 @@ class _Pairs(NamedTuple):
             _refuse_table(table)
         sides = []
         for (mdp, states, labels), which in zip(self[:2], _NAMES, strict=True):
-            graph_of = mdp if table is None else table_for(table, mdp, labels=labels, **kind).mdp
+            graph_of = mdp if table is None else table_for(table, mdp, for_graph=True, **kind).mdp
             sides.append(TracedStates(mdp, states, labels, graph_of, which))
         return brackets_in_program(*sides, goal, name=name, **kind)
 

@@ -85,5 +85,11 @@ def pair_keys(pairs: np.ndarray) -> np.ndarray:
     return (pairs[:, 0].astype(np.int64) << 32) | pairs[:, 1]
 
 
+def pair_set(pairs: np.ndarray) -> np.ndarray:
+    """The different ones of pairs [P, 2], in the order of their keys."""
+    _, first = np.unique(pair_keys(pairs), return_index=True)
+    return pairs[first]
+
+
 def _kind(goal: Goal) -> int:
     return 0 if goal.decides else 1 + METHODS.index(goal.method)

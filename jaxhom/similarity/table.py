@@ -30,7 +30,7 @@ from jaxhom.similarity.decisions import (
 )
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
-from jaxhom.similarity.pair_bounds import PairBounds, pair_keys
+from jaxhom.similarity.pair_bounds import PairBounds, pair_keys, pair_set
 from jaxhom.similarity.relations import UserRelation, pair_errors
 from jaxhom.solvers.lane_queue import is_settled
 
@@ -133,6 +133,11 @@ class SimilarityTable:
         return self._pairs.has_maps
 
     @property
+    def renames(self) -> bool:
+        """Whether actions of a target may stand for others of a source: the relation "lax"."""
+        return self.given_relation == "lax"
+
+    @property
     def num_classes(self) -> int:
         """How many different local models have been met."""
         return len(self._book)
@@ -201,22 +206,33 @@ class SimilarityTable:
         *,
         mutual: bool = False,
         tolerance: float = 1e-4,
+        with_errors: bool = False,
         progress: bool = False,
     ) -> Decisions:
-        """As `decide`, and says which of the pairs that count as different could not be decided, and why."""
+        """As `decide`, and says which of the pairs that count as different could not be decided, and why.
+
+        With errors, those of similar pairs are bracketed to the tolerance; if mutual, the larger of both directions.
+        """
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
+        back = pairs[:, ::-1]
         if mutual:
-            back = pairs[:, ::-1]
             is_asked = ~is_far(self._known.look_up(back), goal)
             self._settle(pairs[is_asked], goal, progress)
             self._settle(back[is_asked & is_similar(self._known.look_up(pairs), goal)], goal, progress)
         else:
             self._settle(pairs, goal, progress)
-        return jax.tree.map(lambda leaf: leaf[where], self._decided(pairs, goal, mutual))
+        found = self._decided(pairs, goal, mutual)
+        if with_errors:
+            ways = [pairs, back][: 1 + mutual]
+            self._settle(pair_set(np.concatenate([way[found.similar] for way in ways])), Goal(tolerance), progress)
+            found = found.replace(error=self._errors_of(ways, tolerance))
+        return jax.tree.map(lambda leaf: leaf[where], found)
 
     @checks.eager_where_concrete
-    def complete(self, threshold: float = 0.0, *, tolerance: float = 1e-4, progress: bool = False) -> SimilarityTable:
+    def complete(
+        self, threshold: float = 0.0, *, tolerance: float = 1e-4, with_errors: bool = False, progress: bool = False
+    ) -> SimilarityTable:
         """Decides e <= threshold for all ordered pairs of classes of the model, and returns the table.
 
         Then `soft_local_homomorphism(..., threshold=threshold, table=table)` solves nothing any more, for whatever
@@ -226,6 +242,7 @@ class SimilarityTable:
         Args:
           threshold: epsilon >= 0.
           tolerance: an error up to threshold + tolerance may count as similar.
+          with_errors: bracket the errors of similar pairs to the tolerance too, which weights="similarity" needs.
           progress: show a progress bar.
 
         Raises:
@@ -239,17 +256,24 @@ class SimilarityTable:
         """
         goal = Goal.checked(tolerance=tolerance, threshold=threshold)
         self.classes()
-        self._settle(every_pair(self.num_classes), goal, progress)
+        pairs = every_pair(self.num_classes)
+        self._settle(pairs, goal, progress)
+        similar = pairs[is_similar(self._known.look_up(pairs), goal)]
+        if with_errors:
+            self._settle(similar, Goal(tolerance), progress)
+        self._pairs.renamings(similar)
         return self
 
     @checks.eager_where_concrete
-    def relation(self, threshold: float = 0.0, *, mutual: bool = False, tolerance: float = 1e-4) -> Relation:
+    def relation(
+        self, threshold: float = 0.0, *, mutual: bool = False, tolerance: float = 1e-4, with_errors: bool = False
+    ) -> Relation:
         """Which classes are similar, as `decisions` says it of their states; of a completed table, without solving.
 
         Args:
           threshold: epsilon >= 0, one that the table was completed for.
           mutual: require the error of both directions to be within the threshold.
-          tolerance: as it was when the table was completed.
+          tolerance, with_errors: as they were when the table was completed.
 
         Returns:
           `Relation`.
@@ -267,9 +291,18 @@ class SimilarityTable:
             )
         pairs = every_pair(self.num_classes)
         require_decided(self._is_to_solve(pairs, goal), threshold, tolerance)
-        found = self._decided(pairs, goal, mutual)
-        square = (self.num_classes,) * 2
-        return Relation(label=label, similar=found.similar.reshape(square), status=found.status.reshape(square))
+        found, square = self._decided(pairs, goal, mutual), (self.num_classes,) * 2
+        relation = Relation(label=label, similar=found.similar.reshape(square), status=found.status.reshape(square))
+        if with_errors:
+            ways = [pairs, pairs[:, ::-1]][: 1 + mutual]
+            is_open = [found.similar & self._is_to_solve(way, Goal(tolerance)) for way in ways]
+            require_decided(np.concatenate(is_open), threshold, tolerance, ", with_errors=True")
+            relation = relation.replace(error=self._errors_of(ways, tolerance).reshape(square))
+        if self.renames:
+            renaming = np.zeros((*square, self.mdp.num_actions), np.int32)
+            renaming[relation.similar] = self._pairs.renamings(pairs[found.similar])
+            relation = relation.replace(renaming=renaming)
+        return relation
 
     @checks.eager_where_concrete
     def renamings(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> np.ndarray | None:
@@ -353,6 +386,10 @@ class SimilarityTable:
         """What is known of pairs of classes [Q, 2], in both directions if `mutual`."""
         back = self._known.look_up(pairs[:, ::-1]) if mutual else None
         return decisions_of(self._known.look_up(pairs), goal, back)
+
+    def _errors_of(self, ways: list[np.ndarray], tolerance: float) -> np.ndarray:
+        """[Q]: upper bounds on the errors of pairs of classes [Q, 2]; the largest of those of each pair's ways."""
+        return np.maximum.reduce([self._widened(way, Goal(tolerance)).upper for way in ways])
 
     def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""

@@ -44,7 +44,8 @@ class Profile(NamedTuple):
       keeps: [P, V], c, as far as the target has a say.
       width, size: [P, V], how far the numbers are apart, and the largest of them.
       rows: [P], largest sum of a row, at least 1.
-      rounding: [P], of probabilities; of labels that times `largest`, [P].
+      rounding: [P], of probabilities, in the type of the models: equal ones may differ by it in theirs. That of labels
+        is this times `largest`, [P].
     """
 
     stays: np.ndarray
@@ -63,7 +64,7 @@ class Profile(NamedTuple):
     @classmethod
     def of(cls, models: Float[np.ndarray, "P n A n"], labels: Float[np.ndarray, "P n A L"] | None = None) -> Profile:
         """Profiles of models whose padding, if any, is zero."""
-        models = models.astype(np.float64)
+        rounding, models = (models.shape[1] + 8.0) * np.finfo(models.dtype).eps, models.astype(np.float64)
         count, n, num_actions, _ = models.shape
         labels = np.zeros((count, n, num_actions, 0)) if labels is None else labels.astype(np.float64)
         kept = labels.reshape(count, n, -1)
@@ -85,7 +86,7 @@ class Profile(NamedTuple):
             width=kept.max(axis=1) - kept.min(axis=1),
             size=np.abs(kept).max(axis=1, initial=0.0),
             rows=np.maximum(models.sum(axis=3).max(axis=(1, 2)), 1.0),
-            rounding=np.full(count, (n + 2.0) * 4.0 * _EPS),
+            rounding=np.full(count, rounding),
             largest=np.abs(labels).max(axis=(1, 2, 3), initial=0.0),
         )
 

@@ -349,7 +349,7 @@ def test_decisions_stop_early():
     decided.decide(*pairs, 0.9, tolerance=1e-5)
     # Read without solving: the bounds of the decisions are within a gap of 2.
     assert decided.brackets(*pairs, tolerance=2.0).iterations.mean() < 0.5 * steps
-    assert decided.num_solved == open_.num_solved
+    assert 0 < decided.num_solved <= open_.num_solved
 
 
 # ------------------------------------------------------------------------------ what is refused

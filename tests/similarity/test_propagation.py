@@ -61,6 +61,7 @@ def case(kind, marks, dtype, anchored):
     labels = [np.zeros((*side.shape[:3], num_labels)) for side in arrays]
     sizes = np.ones((2, MODELS), int)
     for k in range(MODELS):
+        model, label = None, None
         for side in (1, 0):
             if side == 0 and k % 2:
                 model, label = lifted(rng, model, label)

@@ -164,7 +164,7 @@ def bracket_errors(
     (waiting,) = np.nonzero(~(result.lower > goal.threshold))
     progress = progress or _no_progress
     progress(len(result.lower) - len(waiting))
-    if goal.decides and goal.method == "auto":
+    if goal.decides and goal.method == "auto" and waiting.size:
         waiting = _decide_by_intervals(models, waiting, goal, result, progress)
     for start in range(0, len(waiting), _CHUNK_PAIRS):
         chunk = waiting[start : start + _CHUNK_PAIRS]

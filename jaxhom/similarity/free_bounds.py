@@ -1,6 +1,6 @@
 """Bounds on the errors of LP (9) that cost no iterations: they decide many pairs that are clearly different.
 
-Of each model a few numbers are enough, its `Profile`; many pairs of few models are compared without their tensors.
+Of each model a few numbers are enough: many pairs of few models are compared without the tensors of each pair.
 
 *The centre.* It is mapped to the centre, so (K f)(0,a,0) >= T(0,a,0) - T'(0,a,0): the maps of the other states only add
 to it. And off the centre (K f)(0,a,k) <= sum_{j != 0} T(0,a,j) - T'(0,a,k): what leaves is all that can arrive. Labels
@@ -33,40 +33,75 @@ _CHUNK_ENTRIES = 2**21  # of expectations that are compared at a time
 _EPS = np.finfo(np.float64).eps
 
 
-class Profile(NamedTuple):
-    """What bounds need of P models, in float64; V numbers of states are expected A times.
+def lower_bounds_without_iterations(models: ModelPairs) -> Float[np.ndarray, " P"]:
+    """Lower bounds on the anchored errors of P pairs of models, in their type."""
+    parts = [(_Centre.of, _centres_apart)]
+    if models.num_labels:
+        parts.append((_Expectations.of, _expectations_apart))
+    labels = models.source_labels, models.target_labels
+    bounds = np.zeros(len(models.pairs), models.dtype)
+    # Rows that are equal but for the rounding of the models' type are the same.
+    rounding = (models.source.shape[1] + models.target.shape[1] + 16.0) * np.finfo(models.dtype).eps
+    for profile_of, apart in parts:
+        sides = [profile_of(*side) for side in zip((models.source, models.target), labels, strict=True)]
+        chunk = max(1, _CHUNK_ENTRIES // max(1, sum(leaf[:1].size for leaf in sides[0])))
+        for start in range(0, len(bounds), chunk):
+            part = slice(start, start + chunk)
+            one, other = (
+                type(side)(*(leaf[index] for leaf in side))
+                for side, index in zip(sides, models.pairs[part].T, strict=True)
+            )
+            bounds[part] = np.maximum(bounds[part], rounded_down(apart(one, other, rounding), models.dtype))
+    return bounds
 
-    Attributes:
-      stays, leaves, arrives: [P, A], of the centre: T(0,a,0), sum_{j != 0} T(0,a,j), and max_{k != 0} T(0,a,k).
-      labels: [P, A, L], of the centre.
-      expects: [P, A, V], what the centre expects of labels, and of what is expected of them a step later.
-      num_successors: [P, A], of the centre.
-      keeps: [P, V], c, as far as the target has a say.
-      width, size: [P, V], how far the numbers are apart, and the largest of them.
-      rows: [P], largest sum of a row, at least 1.
-      rounding: [P], of probabilities, in the type of the models: equal ones may differ by it in theirs. That of labels
-        is this times `largest`, [P].
-    """
+
+class _Centre(NamedTuple):
+    """Of the centres of P models, [P, A] in float64: T(0,a,0), sum_{j != 0} T(0,a,j), and max_{k != 0} T(0,a,k)."""
 
     stays: np.ndarray
     leaves: np.ndarray
     arrives: np.ndarray
+
+    @classmethod
+    def of(cls, models: np.ndarray, labels: np.ndarray | None) -> _Centre:
+        del labels
+        centre = models[:, 0].astype(np.float64)
+        return cls(centre[:, :, 0], centre[:, :, 1:].sum(axis=2), centre[:, :, 1:].max(axis=2, initial=-1.0))
+
+
+def _centres_apart(source: _Centre, target: _Centre, rounding: float) -> Float[np.ndarray, " P"]:
+    staying, leaving = source.stays - target.stays, target.arrives - source.leaves
+    return np.maximum(staying, leaving).max(axis=1) - rounding
+
+
+class _Expectations(NamedTuple):
+    """What the centres of P models expect, in float64: of V numbers of states, after each of A actions.
+
+    Attributes:
+      labels: [P, A, L], of the centre itself.
+      expects: [P, A, V], of labels, and of what is expected of them a step later.
+      sums: [P, A], of the centre's rows. num_successors: [P, A], their entries.
+      keeps: [P, V], c, as far as the target has a say.
+      width, size: [P, V], how far the numbers are apart, and the largest of them.
+      rows: [P], largest sum of a row, at least 1.
+      largest: [P], of the labels.
+    """
+
     labels: np.ndarray
     expects: np.ndarray
+    sums: np.ndarray
     num_successors: np.ndarray
     keeps: np.ndarray
     width: np.ndarray
     size: np.ndarray
     rows: np.ndarray
-    rounding: np.ndarray
     largest: np.ndarray
 
     @classmethod
-    def of(cls, models: Float[np.ndarray, "P n A n"], labels: Float[np.ndarray, "P n A L"] | None = None) -> Profile:
-        """Profiles of models whose padding, if any, is zero."""
-        rounding, models = (models.shape[1] + 8.0) * np.finfo(models.dtype).eps, models.astype(np.float64)
+    def of(cls, models: np.ndarray, labels: np.ndarray) -> _Expectations:
+        """Of models whose padding, if any, is zero."""
+        models, labels = models.astype(np.float64), labels.astype(np.float64)
         count, n, num_actions, _ = models.shape
-        labels = np.zeros((count, n, num_actions, 0)) if labels is None else labels.astype(np.float64)
         kept = labels.reshape(count, n, -1)
         keeps = np.ones((count, kept.shape[2]))
         if num_actions * kept.shape[2] * (1 + num_actions) <= _MAX_EXPECTATIONS:
@@ -74,60 +109,33 @@ class Profile(NamedTuple):
             later = np.tile(keeps + np.abs(kept).sum(axis=1), num_actions)
             kept, keeps = np.concatenate([kept, ahead], axis=2), np.append(keeps, later, axis=1)
         centre = models[:, 0]
-        away = centre[:, :, 1:]
         return cls(
-            stays=centre[:, :, 0],
-            leaves=away.sum(axis=2),
-            arrives=away.max(axis=2, initial=-1.0),
             labels=labels[:, 0],
             expects=centre @ kept,
+            sums=centre.sum(axis=2),
             num_successors=(centre > 0.0).sum(axis=2),
             keeps=keeps,
             width=kept.max(axis=1) - kept.min(axis=1),
-            size=np.abs(kept).max(axis=1, initial=0.0),
+            size=np.abs(kept).max(axis=1),
             rows=np.maximum(models.sum(axis=3).max(axis=(1, 2)), 1.0),
-            rounding=np.full(count, rounding),
-            largest=np.abs(labels).max(axis=(1, 2, 3), initial=0.0),
+            largest=np.abs(labels).max(axis=(1, 2, 3)),
         )
 
-    def of_models(self, index) -> Profile:
-        """Those of some of the models."""
-        return Profile(*(leaf[index] for leaf in self))
 
-
-def lower_bounds_without_iterations(models: ModelPairs) -> Float[np.ndarray, " P"]:
-    """Lower bounds on the anchored errors of P pairs of models, in their type."""
-    sides = Profile.of(models.source, models.source_labels), Profile.of(models.target, models.target_labels)
-    bounds = np.zeros(len(models.pairs), models.dtype)
-    chunk = max(1, _CHUNK_ENTRIES // max(1, *(leaf[:1].size for leaf in sides[0])))
-    for start in range(0, len(bounds), chunk):
-        part = slice(start, start + chunk)
-        chosen = (side.of_models(index) for side, index in zip(sides, models.pairs[part].T, strict=True))
-        bounds[part] = rounded_down(_lower_bounds(*chosen), models.dtype)
-    return bounds
+def _expectations_apart(source: _Expectations, target: _Expectations, rounding: float) -> Float[np.ndarray, " P"]:
+    apart = np.abs(source.labels - target.labels).max(axis=(1, 2)) * (1.0 - 4.0 * _EPS)
+    uneven = np.abs(source.sums - target.sums)[:, :, None]
+    difference = np.abs(source.expects - target.expects) - uneven * target.size[:, None]
+    difference -= (4.0 * rounding * np.maximum(source.largest, target.largest))[:, None, None]
+    factor = target.keeps[:, None] + target.num_successors[:, :, None] * target.width[:, None]
+    ahead = (difference / factor).max(axis=(1, 2)) / source.rows**2 * (1.0 - 8.0 * _EPS)
+    return np.maximum(apart, ahead)
 
 
 def rounded_down(bounds: np.ndarray, dtype) -> np.ndarray:
     """Lower bounds in another type, none of them larger than before."""
     rounded = bounds.astype(dtype)
     return np.where(rounded > bounds, np.nextafter(rounded, rounded.dtype.type(0)), rounded)
-
-
-def _lower_bounds(source: Profile, target: Profile) -> Float[np.ndarray, " P"]:
-    """Lower bounds on the anchored errors of P pairs, from profiles [P] of both sides; float64, rounding included."""
-    rounding = source.rounding + target.rounding
-    staying = (source.stays - target.stays).max(axis=1)
-    leaving = (target.arrives - source.leaves).max(axis=1)
-    bound = np.maximum(staying, leaving) - rounding
-    apart = np.abs(source.labels - target.labels).max(axis=(1, 2), initial=0.0)
-    bound = np.maximum(bound, apart * (1.0 - 4.0 * _EPS))
-    if source.expects.shape[2]:
-        uneven = np.abs(source.stays + source.leaves - target.stays - target.leaves)[:, :, None]
-        difference = np.abs(source.expects - target.expects) - uneven * target.size[:, None]
-        difference -= (4.0 * rounding * np.maximum(source.largest, target.largest))[:, None, None]
-        factor = target.keeps[:, None] + target.num_successors[:, :, None] * target.width[:, None]
-        bound = np.maximum(bound, (difference / factor).max(axis=(1, 2)) / source.rows**2 * (1.0 - 8.0 * _EPS))
-    return np.maximum(bound, 0.0)
 
 
 def upper_bounds_without_iterations(models: ModelPairs) -> Float[np.ndarray, " P"]:

@@ -20,8 +20,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy
 
+from jaxhom.similarity.blocks import Blocks
 from jaxhom.similarity.free_bounds import rounded_down
 from jaxhom.similarity.host_certificates import Certificate
 from jaxhom.similarity.model_pairs import ModelPairs
@@ -33,8 +33,9 @@ _LEVELS = (0.25,)  # tried before the threshold, where they are well above: what
 _WELL_ABOVE = 2.0  # times the threshold
 _BAND_SHARE = 0.5  # of the tolerance, above the threshold: different is what is proved to be beyond that
 _LEAST_SHRINKAGE = 0.1  # of the widths, in a sweep: with less, they are left as they are
+_NARROW = 0.1  # of the tolerance: what is left of the widths then makes no difference
 _CHUNK_ENTRIES = 2**17  # of the slacks of the pairs that are looked at together: they fit into the cache
-_MAX_SHARES = 2**22  # of slacks at a time: 32 MB
+_MAX_WORK = 2**28  # entries of models times entries of maps, of a pair: seconds for a sweep
 _EPS = np.finfo(np.float64).eps
 
 
@@ -55,10 +56,11 @@ def bounds_by_intervals(
     levels = np.array([*(level for level in _LEVELS if level > _WELL_ABOVE * base), base])
     proved = rounded_down(levels, models.dtype)
     sides = _Sides.of(models)
+    (affordable,) = np.nonzero(sides.work(models.pairs[asked]) <= _MAX_WORK)
     _, n, num_actions, _ = models.source.shape
     chunk = max(1, _CHUNK_ENTRIES // (2 * n * num_actions * (models.target.shape[1] + 2 * models.num_labels)))
-    for start in range(0, len(asked), chunk):
-        waiting = np.arange(start, min(start + chunk, len(asked)))
+    for start in range(0, len(affordable), chunk):
+        waiting = affordable[start : start + chunk]
         boxes = sides.boxes(models.pairs[asked[waiting]])
         level = np.zeros(len(waiting), int)
         while waiting.size:
@@ -71,7 +73,9 @@ def bounds_by_intervals(
             before = boxes.widths()
             is_empty = boxes.shrink(*(slack[~is_empty] for slack in slacks))
             lower[waiting[is_empty]] = proved[level[is_empty]]
-            is_still = ~is_empty & ~(boxes.widths() < (1.0 - _LEAST_SHRINKAGE) * before)
+            widths = boxes.widths()
+            is_shrinking = (widths < (1.0 - _LEAST_SHRINKAGE) * before) & (widths > _NARROW * tolerance)
+            is_still = ~is_empty & ~is_shrinking
             is_last = is_still & (level == len(levels) - 1)
             if is_last.any():
                 last = waiting[is_last]
@@ -83,66 +87,11 @@ def bounds_by_intervals(
     return lower, upper
 
 
-class _Blocks(NamedTuple):
-    """Blocks on the diagonal of a matrix of weights >= 0, one of a shape for every pair, compressed by columns.
-
-    Attributes:
-      weight: [E], positive. row: int [E], in the whole matrix. start: int [P * columns + 1], where columns begin.
-      shape: rows and columns of a block.
-    """
-
-    weight: np.ndarray
-    row: np.ndarray
-    start: np.ndarray
-    shape: tuple[int, int]
-
-    @classmethod
-    def of(cls, columns: Float[np.ndarray, "P columns rows"]) -> _Blocks:
-        """The transposes of matrices."""
-        count, num_columns, num_rows = columns.shape
-        block, column, row = np.nonzero(columns)
-        start = np.zeros(count * num_columns + 1, np.int64)
-        np.cumsum(np.bincount(block * num_columns + column, minlength=count * num_columns), out=start[1:])
-        return cls(columns[block, column, row], block * num_rows + row, start, (num_rows, num_columns))
-
-    def part(self, index: Int[np.ndarray, " Q"]) -> _Blocks:
-        """Some of the blocks, any of them as often as it is named."""
-        num_rows, num_columns = self.shape
-        counts = np.diff(self.start).reshape(-1, num_columns)[index]
-        sizes = counts.sum(axis=1)
-        start = np.append(0, np.cumsum(counts))
-        block = np.repeat(np.arange(len(index)), sizes)
-        entry = np.arange(start[-1]) + (self.start[index * num_columns] - start[:-1:num_columns])[block]
-        row = self.row[entry] + ((np.arange(len(index)) - index) * num_rows)[block]
-        return _Blocks(self.weight[entry], row, start, self.shape)
-
-    def times(self, matrices: np.ndarray) -> np.ndarray:
-        """Products with [P, columns, K]: [P, rows, K]."""
-        count, columns, width = matrices.shape
-        shape = (count * self.shape[0], count * columns)
-        whole = scipy.sparse.csc_array((self.weight, self.row, self.start), shape=shape)
-        return (whole @ matrices.reshape(-1, width)).reshape(count, -1, width)
-
-    def least(self, slack: np.ndarray) -> np.ndarray:
-        """Least of slack [P, rows, 2, K] / weight over entries of columns: [P, columns, 2, K], infinite over none."""
-        count, _, _, most = slack.shape
-        width = 2 * most
-        slack = slack.reshape(-1, width)
-        found = np.full((len(self.start) - 1, width), np.inf)
-        (filled,) = np.nonzero(np.diff(self.start))
-        step = max(1, _MAX_SHARES // max(1, len(self.row)))
-        for first in range(0, width if filled.size else 0, step):
-            part = slice(first, first + step)
-            shares = slack[self.row, part] / self.weight[:, None]
-            found[filled, part] = np.minimum.reduceat(shares, self.start[filled], axis=0)
-        return found.reshape(count, -1, 2, most)
-
-
 class _Sides(NamedTuple):
     """What boxes are made of, once for each model: blocks as `_Boxes` has them, and of labels the range in targets."""
 
-    source: _Blocks
-    target: _Blocks
+    source: Blocks
+    target: Blocks
     is_row: np.ndarray
     is_column: np.ndarray
     labels: np.ndarray
@@ -165,8 +114,8 @@ class _Sides(NamedTuple):
         shifted = np.where(is_state, _from_both_ends(theirs, least[:, None], largest[:, None]), 0.0)
         target = np.concatenate([target, shifted], axis=3)
         return cls(
-            _Blocks.of(source.transpose(0, 3, 1, 2).reshape(*source.shape[:2], -1)),
-            _Blocks.of(target.reshape(*target.shape[:2], -1)),
+            Blocks.of(source.transpose(0, 3, 1, 2).reshape(*source.shape[:2], -1)),
+            Blocks.of(target.reshape(*target.shape[:2], -1)),
             is_row,
             is_column,
             ours,
@@ -175,6 +124,11 @@ class _Sides(NamedTuple):
             tuple(np.abs(side).max(axis=(1, 2, 3), initial=0.0) for side in (ours, theirs)),
             models.anchored,
         )
+
+    def work(self, pairs: Int[np.ndarray, "P 2"]) -> Int[np.ndarray, " P"]:
+        """Multiplications for each pair in a sweep, about."""
+        (one, other), n, m = pairs.T, self.is_row.shape[1], self.is_column.shape[1]
+        return 2 * (self.source.num_entries()[one] * m + self.target.num_entries()[other] * n)
 
     def boxes(self, pairs: Int[np.ndarray, "P 2"]) -> _Boxes:
         """All maps of pairs of models, and those alone."""
@@ -203,8 +157,8 @@ class _Boxes(NamedTuple):
     """
 
     bounds: np.ndarray
-    source: _Blocks
-    target: _Blocks
+    source: Blocks
+    target: Blocks
     labels: np.ndarray
     is_row: np.ndarray
     rounding: np.ndarray
@@ -212,7 +166,7 @@ class _Boxes(NamedTuple):
     def part(self, kept: Bool[np.ndarray, " P"]) -> _Boxes:
         """Those of some pairs."""
         (index,) = np.nonzero(kept)
-        return _Boxes(*(leaf.part(index) if isinstance(leaf, _Blocks) else leaf[index] for leaf in self))
+        return _Boxes(*(leaf.part(index) if isinstance(leaf, Blocks) else leaf[index] for leaf in self))
 
     def widths(self) -> Float[np.ndarray, " P"]:
         """Sums of U - L."""

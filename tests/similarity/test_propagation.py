@@ -10,7 +10,7 @@ import oracles
 import pytest
 
 from jaxhom import MDP, SimilarityTable, Status
-from jaxhom.similarity import propagation
+from jaxhom.similarity import blocks, propagation
 from jaxhom.similarity.brackets import Goal, bracket_errors
 from jaxhom.similarity.free_bounds import lower_bounds_without_iterations, upper_bounds_without_iterations
 from jaxhom.similarity.model_pairs import ModelPairs
@@ -175,10 +175,24 @@ def test_a_few_entries_at_a_time(monkeypatch):
     """The same bounds to the last bit."""
     models, error = case("sparse", "refused", "float64", True)
     whole = bounds_by_intervals(models, np.arange(len(error)), 0.05, TOLERANCE)
-    monkeypatch.setattr(propagation, "_MAX_SHARES", 100)
+    monkeypatch.setattr(blocks, "_MAX_SHARES", 100)
     monkeypatch.setattr(propagation, "_CHUNK_ENTRIES", 1000)
     parts = bounds_by_intervals(models, np.arange(len(error)), 0.05, TOLERANCE)
     np.testing.assert_array_equal(whole, parts)
+
+
+def test_pairs_of_models_with_too_many_entries_are_left_alone(monkeypatch):
+    models, error = case("stochastic", "none", "float64", True)
+    asked = np.arange(len(error))
+    work = 2 * (models.source_size**2)[models.pairs[:, 0]] * NUM_ACTIONS * TARGET_WIDTH
+    work += 2 * (models.target_size**2)[models.pairs[:, 1]] * NUM_ACTIONS * SOURCE_WIDTH
+    whole = bounds_by_intervals(models, asked, 0.05, TOLERANCE)
+    limit = int(np.median(work))
+    monkeypatch.setattr(propagation, "_MAX_WORK", limit)
+    for found, before, nothing in zip(
+        bounds_by_intervals(models, asked, 0.05, TOLERANCE), whole, (0, np.inf), strict=True
+    ):
+        np.testing.assert_array_equal(found, np.where(work <= limit, before, nothing))
 
 
 def test_pairs_that_are_not_numbers_are_not_decided():

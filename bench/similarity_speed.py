@@ -319,8 +319,14 @@ def highs_global(size: int, mdp, demonstrations) -> dict:
     """LP (8) by HiGHS's interior point, certified by us."""
     experts = np.unique(np.asarray(demonstrations.states)[np.asarray(demonstrations.mask)])
     restricted = restricted_model(mdp, experts)
-    pinned = jnp.zeros((mdp.num_states, len(experts)), bool)
-    problem = GlobalHomomorphismProblem(mdp=mdp, restricted=jnp.asarray(restricted), pinned=pinned)
+    problem = GlobalHomomorphismProblem(
+        mdp=mdp,
+        target=jnp.asarray(restricted),
+        pinned=jnp.zeros((mdp.num_states, len(experts)), bool),
+        exists=jnp.ones(len(experts), bool),
+        labels=None,
+        target_labels=None,
+    )
     pairs, settings = [(np.asarray(mdp.transition), restricted)], Settings(0.1 * GLOBAL_GAP, _TIGHT)
     fields = sizes(mdp.num_states, len(experts), mdp.num_actions) | {"gap_asked": GLOBAL_GAP}
     fields |= {"note": f"{size} x {size} grid, one process"}

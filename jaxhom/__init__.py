@@ -16,7 +16,9 @@ from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
+from jaxhom.generalization.choice import choose_generalization
 from jaxhom.generalization.explanation import Explanation
+from jaxhom.generalization.model_map import SoftHomomorphism
 from jaxhom.generalization.neighbors import nearest_neighbors
 from jaxhom.generalization.regression import occupancy_regression
 from jaxhom.generalization.result import Generalization
@@ -60,9 +62,11 @@ __all__ = [
     "Plan",
     "Racetrack",
     "SimilarityTable",
+    "SoftHomomorphism",
     "Status",
     "TileMap",
     "agreement",
+    "choose_generalization",
     "disjoint_union",
     "empirical_policy",
     "evaluate_by_sampling",

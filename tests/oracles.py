@@ -192,14 +192,14 @@ def homomorphism_residual(source, target, mapping):
     return np.max(np.abs(through_source - through_target))
 
 
-def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
+def homomorphism_lp(source, target, anchored=True, labels=None, refused=False, pinned=()):
     """LP (9) between `source` [n, A, n] and `target` [m, A, m]: (error, map [n, m]).
 
     Minimise e over f >= 0 with sum_k f(i, k) = 1 and, for all i, k, a,
     |sum_j T(i, a, j) f(j, k) - sum_j f(i, j) T'(j, a, k)| <= e.
     `anchored` requires in addition f(0, 0) = 1: state 0 is the centre of both models. `labels`, [n, A, L] and
     [m, A, L], add |l(i, a) - sum_k f(i, k) l'(k, a)| <= e for every label. `refused`: the last state of each model is
-    mapped to the other, and nothing else is.
+    mapped to the other, and nothing else is. `pinned`: pairs (i, k) with f(i, k) = 1.
     The variables are f, row by row, and e.
     """
     n, num_actions, _ = source.shape
@@ -220,6 +220,8 @@ def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
     bounds = [(0.0, None)] * (n * m + 1)
     if anchored:
         bounds[0] = (1.0, 1.0)
+    for i, k in pinned:
+        bounds[i * m + k] = (1.0, 1.0)
     if refused:
         for i in range(n):
             bounds[i * m + m - 1] = (float(i == n - 1),) * 2
@@ -234,13 +236,100 @@ def homomorphism_lp(source, target, anchored=True, labels=None, refused=False):
     return result.fun, result.x[:-1].reshape(n, m)
 
 
-def global_homomorphism_lp(transition, visited):
+def lax_homomorphism_lp(source, target, anchored=True, labels=None):
+    """(error, permutations): the least error of LP (9) over all permutations of the target's actions, and the best.
+
+    permutation[a] is the action of the target that stands for the source's action a.
+    """
+    errors = {}
+    for order in itertools.permutations(range(source.shape[1])):
+        renamed = None if labels is None else (labels[0], labels[1][:, list(order)])
+        errors[order] = homomorphism_lp(source, target[:, list(order)], anchored, renamed)[0]
+    least = min(errors.values())
+    return least, [order for order, error in errors.items() if error <= least + 1e-6]
+
+
+def are_isomorphic(source, target, anchored=True, labels=None):
+    """Whether some renaming of the states, that of the centre being itself, makes the models equal to 1e-9."""
+    if source.shape != target.shape:
+        return False
+    for order in itertools.permutations(range(len(source))):
+        if anchored and order[0] != 0:
+            continue
+        order = list(order)
+        same = np.abs(source - target[order][:, :, order]).max() < 1e-9
+        if same and (labels is None or np.abs(labels[0] - labels[1][order]).max() < 1e-9):
+            return True
+    return False
+
+
+def weisfeiler_lehman_kernel(source, target, rounds, anchored=True, labels=None):
+    """Normalised subtree kernel; a colour is written out: a state's own one and those around it, both ways."""
+
+    def histogram(transition, label):
+        states = range(len(transition))
+        edges = [(i, a, j) for i, a, j in zip(*np.nonzero(transition), strict=True)]
+        colour = {i: (anchored and i == 0, () if label is None else tuple(label[i].ravel().round(9))) for i in states}
+        counts = {}
+        for number in range(rounds + 1):
+            for i in states:
+                key = (number, colour[i])
+                counts[key] = counts.get(key, 0) + 1
+            out = {i: [] for i in states}
+            into = {i: [] for i in states}
+            for i, a, j in edges:
+                out[i].append((int(a), round(float(transition[i, a, j]), 9), colour[j]))
+                into[j].append((int(a), round(float(transition[i, a, j]), 9), colour[i]))
+            colour = {i: (colour[i], tuple(sorted(out[i])), tuple(sorted(into[i]))) for i in states}
+        return counts
+
+    one, other = (
+        histogram(model, None if labels is None else labels[side]) for side, model in enumerate((source, target))
+    )
+
+    def product(x, y):
+        return sum(count * y.get(key, 0) for key, count in x.items())
+
+    return product(one, other) / math.sqrt(product(one, one) * product(other, other))
+
+
+def walk_kernel(source, target, steps, anchored=True, labels=None, continuation=0.5):
+    """Random-walk kernel, not normalised, by walking through all pairs of paths of up to `steps` steps."""
+    num_actions = source.shape[1]
+
+    def look_alike(i, k):
+        return not anchored or (i == 0) == (k == 0)
+
+    def worth(i, k, left):
+        total = 1.0
+        if left == 0:
+            return total
+        for a in range(num_actions):
+            share = continuation / num_actions
+            if labels is not None:
+                share *= math.exp(-np.abs(labels[0][i, a] - labels[1][k, a]).sum())
+            for j in np.flatnonzero(source[i, a]):
+                for m in np.flatnonzero(target[k, a]):
+                    if look_alike(j, m) and (i == j) == (k == m):
+                        total += share * source[i, a, j] * target[k, a, m] * worth(j, m, left - 1)
+        return total
+
+    if anchored:
+        return worth(0, 0, steps)
+    pairs = [worth(i, k, steps) for i in range(len(source)) for k in range(len(target))]
+    return sum(pairs) / len(pairs)
+
+
+def global_homomorphism_lp(transition, visited, labels=None, anchored=False):
     """LP (8) from the model on all states to M^E on the visited ones: (error, map [S, |S^E|]).
 
-    `visited` is bool [S]; the columns of the map are the visited states in increasing order.
+    `visited` is bool [S]; the columns of the map are the visited states in increasing order. `labels` [S, A, L] are
+    kept as well, see `homomorphism_lp`; `anchored` maps every visited state to itself.
     """
-    restricted = restrict(transition, np.flatnonzero(visited).tolist())
-    return homomorphism_lp(transition, restricted, anchored=False)
+    experts = np.flatnonzero(visited).tolist()
+    pair = None if labels is None else (labels, labels[visited])
+    pinned = [(s, k) for k, s in enumerate(experts) if anchored]
+    return homomorphism_lp(transition, restrict(transition, experts), anchored=False, labels=pair, pinned=pinned)
 
 
 # ---------------------------------------------------------------------------- generalization

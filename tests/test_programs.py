@@ -124,6 +124,9 @@ def cases() -> dict[str, Case]:
         "stack_models": Case(
             lambda scale: jaxhom.stack_models([mdp, mdp.replace(features=scale * mdp.features)]).features, one
         ),
+        "disjoint_union": Case(
+            lambda scale: jaxhom.disjoint_union([mdp, mdp.replace(features=scale * mdp.features)]).mdp.features, one
+        ),
         "uniform_elsewhere": Case(
             lambda walks: jaxhom.uniform_elsewhere(mdp, walks),
             walks,

@@ -58,6 +58,13 @@ STEPS = {
     "nearest_neighbors": lambda mdp, policy: jaxhom.nearest_neighbors(mdp, DEMONSTRATIONS),
     "soft_local_homomorphism": lambda mdp, policy: jaxhom.soft_local_homomorphism(mdp, DEMONSTRATIONS),
     "soft_homomorphism": lambda mdp, policy: jaxhom.soft_homomorphism(mdp, DEMONSTRATIONS, tolerance=1e-2),
+    "soft_homomorphism, labels": lambda mdp, policy: jaxhom.soft_homomorphism(
+        mdp, DEMONSTRATIONS, labels=np.asarray(mdp.features), tolerance=1e-2
+    ),
+    "soft_homomorphism, two models": lambda mdp, policy: jaxhom.soft_homomorphism(mdp, mdp, tolerance=1e-2).pull_back(
+        policy
+    ),
+    "disjoint_union": lambda mdp, policy: jaxhom.disjoint_union([mdp, mdp]).place(1, DEMONSTRATIONS).states,
     "local_similarity": lambda mdp, policy: jaxhom.local_similarity(mdp, [0, 1], [2, 3]),
     "lpal": lambda mdp, policy: jaxhom.lpal(mdp, np.full(FEATURES, 3.0), initial_policy=policy),
     "lpal of two": lambda mdp, policy: jaxhom.lpal(mdp, np.array([3.0, 4.0])[:, None] + np.zeros(FEATURES)),

@@ -82,7 +82,7 @@ class ByHomomorphism:
             "anchored" if table.anchored else "as printed",
         ]
         parts += ["both directions"] * rule.mutual + [f"{table.compares} models"] * (table.compares != "homomorphism")
-        parts += [] if table.labels is None else [f"{table.labels.shape[2]} labels"]
+        parts += [] if table.labels is None else [_counted(table.labels.shape[2], "label")]
         parts += [] if rule.voters == "nearest" else [f"voters: {rule.voters}"]
         parts += [f"weights exp(-e / {rule.temperature:g})"] * rule.is_weighted
         return f"Algorithm 1 ({', '.join(parts)})"
@@ -236,11 +236,15 @@ def _voted(voters) -> str:
 
 
 def _states(count: int) -> str:
-    return f"{count} demonstrated state{'s' * (count != 1)}"
+    return _counted(count, "demonstrated state")
 
 
 def _steps(count: int) -> str:
-    return f"{count} step{'s' * (count != 1)}"
+    return _counted(count, "step")
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"
 
 
 def _undecided(general, state: int) -> str:

@@ -7,6 +7,7 @@ in every probability, and in every label by that share of the largest; `ClassPai
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -16,6 +17,9 @@ from jaxhom.similarity.brackets import Goal, LocalSimilarity, bracket_errors, fi
 from jaxhom.similarity.classes import ClassBook, model_rounding
 from jaxhom.similarity.local_models import LocalModelMaker, LocalModels, is_oversized
 from jaxhom.status import Record, Status
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 _SMALL = 8  # local models up to this size share one padding
 _ALIKE_GROUP = 4  # up to 2^4 states both models of a pair are padded alike

@@ -78,8 +78,9 @@ class LaxPairs:
             status[asked] = np.maximum(status[asked], found.status)
             is_better = found.upper < chosen_upper[asked] - goal.tolerance
             chosen[asked[is_better]], chosen_upper[asked[is_better]] = rank, found.upper[is_better]
-        if not goal.decides:
-            self._chosen.update(zip(map(tuple, pairs.tolist()), chosen.tolist(), strict=True))
+        # Final where no other permutation is better by more than the tolerance, as decisions with small errors are.
+        is_final = lower.min(axis=1) >= chosen_upper - _TOLERANCE if goal.decides else np.ones(len(pairs), bool)
+        self._chosen.update(zip(map(tuple, pairs[is_final].tolist()), chosen[is_final].tolist(), strict=True))
         dtype = self._programs.dtype
         least = np.minimum(lower.min(axis=1), best).astype(dtype)
         upper = np.where(np.isfinite(best), best, self._programs.most).astype(dtype)

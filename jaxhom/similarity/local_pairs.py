@@ -116,8 +116,8 @@ def local_similarity(
     kind = {"distance": distance, "anchored": anchored}
     if pairs.is_traced:
         return pairs.brackets_in_program(Goal.checked(**options), table, name="local_similarity", **kind)
-    found, sources, targets = pairs.on_host(table, **kind)
-    return found.brackets(sources, targets, progress=progress, **options)
+    known, sources, targets = pairs.on_host(table, **kind)
+    return known.brackets(sources, targets, progress=progress, **options)
 
 
 @checks.eager_where_concrete
@@ -183,9 +183,9 @@ def locally_similar(
         ways = [pairs, pairs.turned()][: 1 + mutual]
         found = [way.brackets_in_program(Goal.checked(**options), **kind) for way in ways]
         return functools.reduce(operator.and_, (bounds.upper <= threshold + tolerance for bounds in found))
-    found, sources, targets = pairs.on_host(table, **kind)
+    known, sources, targets = pairs.on_host(table, **kind)
     asked = {"mutual": mutual, "tolerance": tolerance, "progress": progress}
-    return found.decide(sources, targets, threshold, **asked)
+    return known.decide(sources, targets, threshold, **asked)
 
 
 class _Side(NamedTuple):

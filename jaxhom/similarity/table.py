@@ -115,7 +115,7 @@ class SimilarityTable:
     def __repr__(self) -> str:
         kind = "anchored" if self.anchored else "as printed"
         kind += "" if self.compares == "homomorphism" else f", {self.compares}"
-        kind += "" if self.labels is None else f", {self.labels.shape[2]} labels"
+        kind += "" if self.labels is None else f", labels: {self.labels.shape[2]}"
         return (
             f"SimilarityTable({self.mdp.num_states} states, distance {self.distance}, {kind}; so far "
             f"{self.num_classes} classes, {len(self._known)} pairs of them)"

@@ -1,0 +1,283 @@
+"""Which way to generalize: the one under which a trajectory that was left out is likeliest.
+
+Nobody knows beforehand which relation between local models carries an expert's actions over best: on one model the
+strict ones do, on another those that accept more. Demonstrations can tell: each is left out in turn, the candidates
+generalize the others, and what counts is the likelihood of the steps that were left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxhom import checks
+from jaxhom.generalization import evidence
+from jaxhom.generalization.algorithm1 import soft_local_homomorphism
+from jaxhom.generalization.neighbors import nearest_neighbors
+from jaxhom.generalization.result import Generalization
+from jaxhom.generalization.uniform import uniform_elsewhere
+from jaxhom.generalization.votes import vote_of_rings
+from jaxhom.generalization.voting import HostBallots, VotingRule
+from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.inputs import as_model
+from jaxhom.models.mdp import MDP, absorbing_states, uniform_policy
+from jaxhom.similarity.lax_pairs import MAX_ACTIONS
+from jaxhom.similarity.relations import RELATIONS
+from jaxhom.similarity.table import SimilarityTable
+from jaxhom.status import Record
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Bool, Num
+
+Candidate = Mapping[str, Any] | Callable[[MDP, Demonstrations], Generalization]
+
+_THRESHOLDS = (0.0, 0.1, 0.2)
+_LITTLE = 0.05
+_MIXINGS = np.geomspace(0.01, 1.0, 33)
+_OF_TABLE = ("distance", "anchored", "labels", "label_weight", "relation")
+_OF_RULE = tuple(field.name for field in dataclasses.fields(VotingRule))
+
+
+class Choice(Record):
+    """The generalization that was chosen, and the scores of all candidates.
+
+    Attributes:
+      best: the winner, fitted to all demonstrations.
+      name: its name.
+      scores: by name, the mean log-likelihood of a step that was left out, in nats; the highest wins, of equal ones the
+        first.
+      standard_errors: by name, those of the scores, from the spread between trajectories.
+    """
+
+    best: Generalization
+    name: str = dataclasses.field(metadata={"static": True})
+    scores: dict[str, float]
+    standard_errors: dict[str, float]
+
+
+def choose_generalization(
+    mdp: MDP,
+    demonstrations: Demonstrations,
+    candidates: Mapping[str, Candidate] | None = None,
+    *,
+    distance: int = 1,
+    labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
+    label_weight: float = 1.0,
+    states: Bool[ArrayLike, " S"] | None = None,
+    mixing: float | None = None,
+    progress: bool = False,
+) -> Choice:
+    """Chooses among ways to generalize by the likelihood of trajectories that were left out.
+
+    Each trajectory is left out in turn. A candidate's score is the mean, over all their steps, of log((1 - mixing)
+    pi(s, a) + mixing u(s, a)): pi is what it makes of the others, u is uniform over the allowed actions.
+
+    Args:
+      mdp: the model.
+      demonstrations: M >= 2 trajectories with steps.
+      candidates: by name, the options of `soft_local_homomorphism` as a mapping; or a function of a model and
+        demonstrations, such as `nearest_neighbors`, `uniform_elsewhere` or one of the user's. `default_candidates` says
+        which if None: LP (9), Weisfeiler-Lehman, random walks and, for up to 6 actions, "lax" at three thresholds,
+        isomorphism, k-NN, and uniform.
+      distance, labels, label_weight, states: what `soft_local_homomorphism` takes, for candidates that do not say
+        otherwise. Steps in states that are left out do not count.
+      mixing: in (0, 1], the share of the uniform policy, without which one wrong step would decide. If None each
+        candidate has the share, from 1 % on, under which it is likeliest: with little of it one that is right in half
+        of the states, which may be by far the best, would score below `uniform_elsewhere`. In states that other
+        trajectories visit too, where there is nothing to generalize, it is 5 %.
+      progress: show a progress bar.
+
+    Returns:
+      `Choice`.
+
+    Raises:
+      ValueError: if fewer than two trajectories have steps that count, there is no candidate, an option is out of range
+        or traced, or a demonstration does not fit the model.
+
+    On the host, not under jit, vmap or grad. Candidates that vote, those given by options and the two functions named
+    above, are asked about all states of all trajectories at once, and share tables of similarities; other functions are
+    called M times.
+
+    Example:
+      >>> import jaxhom
+      >>> grid = jaxhom.gridworld(6)
+      >>> walks = [([0, 1, 2, 3], [2, 2, 2, 2]), ([6, 7, 8, 9], [2, 2, 2, 2]), ([12, 13, 14], [2, 2, 2])]
+      >>> shown = jaxhom.Demonstrations.from_trajectories(walks)
+      >>> choice = jaxhom.choose_generalization(grid, shown)
+      >>> choice.scores["uniform"] < choice.scores["homomorphism 0"] <= choice.scores[choice.name]
+      True
+      >>> choice.best.policy.shape
+      (36, 4)
+
+    Source: cross-validation of Stone 1974, by trajectories.
+    """
+    mdp = as_model(mdp)
+    if checks.is_traced(mdp, demonstrations):
+        raise ValueError("candidates are compared on the host: call choose_generalization outside jit, vmap and grad")
+    checks.refuse_traced(mixing=mixing)
+    if mixing is not None and not 0 < mixing <= 1:
+        raise ValueError(f"mixing must lie in (0, 1], got {mixing}")
+    shared = {"distance": distance, "labels": labels, "label_weight": label_weight, "states": states}
+    if candidates is None:
+        candidates = default_candidates(mdp)
+    if not isinstance(candidates, Mapping) or not candidates:
+        raise ValueError("candidates must be a mapping that is not empty, from names to options or functions")
+    left_out, tables = _LeftOut(mdp, demonstrations, states), _Tables(mdp)
+    known = {name: _checked(name, candidate, shared) for name, candidate in candidates.items()}
+    scores, errors = {}, {}
+    for name, candidate in tqdm(known.items(), desc="candidates", leave=False, disable=not progress):
+        policies = left_out.policies(candidate, tables, progress)
+        scores[name], errors[name] = left_out.score(policies, mixing)
+    name = max(scores, key=scores.__getitem__)
+    best = known[name]
+    if isinstance(best, dict):
+        best = functools.partial(soft_local_homomorphism, **best, table=tables.of(best), progress=progress)
+    return Choice(best=best(mdp, demonstrations), name=name, scores=scores, standard_errors=errors)
+
+
+def default_candidates(mdp: MDP) -> dict[str, Candidate]:
+    """What is chosen from if nothing else is said: strict relations first, k-NN and uniform last."""
+    chosen: dict[str, Candidate] = {}
+    for relation in RELATIONS:
+        if relation == "lax" and as_model(mdp).num_actions > MAX_ACTIONS:
+            continue
+        for threshold in _THRESHOLDS[: 1 if relation == "isomorphic" else None]:
+            chosen[f"{relation} {threshold:g}"] = {"relation": relation, "threshold": threshold}
+    return chosen | {"k-NN": nearest_neighbors, "uniform": uniform_elsewhere}
+
+
+def _checked(name: str, candidate: Any, shared: dict[str, Any]) -> dict[str, Any] | Callable:
+    """A function, or all options of a candidate; or `ValueError` that names it."""
+    if callable(candidate):
+        return candidate
+    if not isinstance(candidate, Mapping):
+        raise ValueError(f"candidates[{name!r}] must be a mapping of options or a function, got {candidate!r}")
+    for option in candidate:
+        if option not in {*_OF_TABLE, *_OF_RULE, "states"}:
+            raise ValueError(f"candidates[{name!r}] has the option {option!r}, which soft_local_homomorphism lacks")
+    options = {**shared, **candidate}
+    try:
+        _rule(options)
+    except ValueError as error:
+        raise ValueError(f"candidates[{name!r}]: {error}") from None
+    return options
+
+
+def _rule(options: dict[str, Any]) -> VotingRule:
+    return VotingRule(**{name: options[name] for name in _OF_RULE if name in options})
+
+
+class _Tables:
+    """Tables of similarities by their options, one for all candidates that share them."""
+
+    def __init__(self, mdp: MDP):
+        self._mdp, self._known = mdp, {}
+
+    def of(self, options: dict[str, Any]) -> SimilarityTable:
+        """The table of a candidate."""
+        kind = {name: options[name] for name in _OF_TABLE if name in options}
+        key = tuple((name, id(value) if name in ("labels", "relation") else value) for name, value in kind.items())
+        if key not in self._known:
+            self._known[key] = SimilarityTable(self._mdp, **kind)
+        return self._known[key]
+
+
+class _LeftOut:
+    """What the expert did, by trajectory and state: V different visits of M trajectories, each to one state.
+
+    A visit is left out with all others of its trajectory: what is known of the expert beside it are the counts of all
+    trajectories less those of its own.
+    """
+
+    def __init__(self, mdp: MDP, demonstrations: Demonstrations, states):
+        self._mdp, self._demonstrations = mdp, demonstrations
+        uniform_elsewhere(mdp, demonstrations)  # which checks them
+        shape, mask = (mdp.num_states, mdp.num_actions), np.asarray(demonstrations.mask)
+        trajectory = np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)[mask]
+        visited, actions = (np.asarray(array)[mask] for array in (demonstrations.states, demonstrations.actions))
+        self._key, where = np.unique(trajectory.astype(np.int64) * shape[0] + visited, return_inverse=True)
+        self._counts = np.zeros((len(self._key), shape[1]))
+        np.add.at(self._counts, (where, actions), 1)
+        self._trajectory, self._state = np.divmod(self._key, shape[0])
+        self._total = np.zeros(shape)
+        np.add.at(self._total, self._state, self._counts)
+        asked = np.ones(shape[0], bool) if states is None else np.asarray(states, bool)
+        self._matters = (asked & ~np.asarray(absorbing_states(mdp)))[self._state]
+        if len(np.unique(self._trajectory[self._matters])) < 2:
+            raise ValueError(
+                "demonstrations must have at least two trajectories with steps in which there is something to decide: "
+                "one is left out at a time, and the others are generalized"
+            )
+        self._owner = np.full(shape[0], -1)  # of states that a single trajectory visits
+        is_only = np.bincount(self._state, minlength=shape[0]) == 1
+        self._owner[self._state] = np.where(is_only[self._state], self._trajectory, -1)
+
+    def policies(self, candidate: dict[str, Any] | Callable, tables: _Tables, progress: bool) -> np.ndarray:
+        """[V, A]: what a candidate makes, in the state of each visit, of the other trajectories."""
+        if callable(candidate) and candidate not in (nearest_neighbors, uniform_elsewhere):
+            return self._one_by_one(candidate)
+        policies = self._without(self._trajectory, self._state)
+        is_alone = ~policies.any(axis=1)
+        elected = uniform_policy(self._mdp).copy()
+        if candidate is nearest_neighbors:
+            elected = vote_of_rings(self._mdp, *self._ends(elected), self._allowed_votes).policy
+        elif isinstance(candidate, dict):
+            table = tables.of(candidate)
+            table.classes(np.flatnonzero(self._total.any(axis=1)))
+            ballots = HostBallots(self._mdp, table, _rule(candidate), self._votes, progress)
+            elected = ballots.elect(*self._ends(elected, candidate.get("states")), None).policy
+        policies[is_alone] = elected[self._state[is_alone]]
+        return policies
+
+    def score(self, policies: np.ndarray, mixing: float | None) -> tuple[float, float]:
+        """The mean log-likelihood of a step, and its standard error."""
+        shares = _MIXINGS if mixing is None else [mixing]
+        log = max((self._log_likelihoods(policies, share) for share in shares), key=np.sum)
+        steps = self._counts[self._matters].sum(axis=1)
+        number = self._trajectory[self._matters]
+        of_trajectory, length = np.bincount(number, log), np.bincount(number, steps)
+        mean, count = log.sum() / steps.sum(), (length > 0).sum()
+        spread = ((of_trajectory - mean * length) ** 2).sum() * count / (count - 1)
+        return float(mean), float(np.sqrt(spread) / length.sum())
+
+    def _log_likelihoods(self, policies: np.ndarray, share: float) -> np.ndarray:
+        """Of each visit that matters."""
+        share = np.where(self._owner[self._state] >= 0, share, _LITTLE)[:, None]
+        mixed = (1.0 - share) * policies + share * uniform_policy(self._mdp)[self._state]
+        return (self._counts * np.log(np.where(self._counts > 0, mixed, 1.0))).sum(axis=1)[self._matters]
+
+    def _ends(self, uniform: np.ndarray, states=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The visited states, the policy where nothing is found, and the states that ask: those of one trajectory."""
+        asking = self._owner >= 0
+        return self._total.any(axis=1), uniform, asking if states is None else asking & np.asarray(states, bool)
+
+    def _votes(self, states: np.ndarray, experts: np.ndarray) -> np.ndarray:
+        """Policies of visited states for states that single trajectories visit, without these."""
+        decides = ~np.asarray(absorbing_states(self._mdp))
+        return self._without(self._owner[states], experts) * decides[experts][:, None]
+
+    def _allowed_votes(self, states: np.ndarray, experts: np.ndarray) -> np.ndarray:
+        return evidence.allowed_part(self._mdp, states, self._votes(states, experts))
+
+    def _without(self, trajectory: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """[P, A]: the expert's policies in states [P] without one trajectory each; zero where it was never there."""
+        key = trajectory.astype(np.int64) * self._mdp.num_states + state
+        place = np.minimum(np.searchsorted(self._key, key), len(self._key) - 1)
+        own = np.where((self._key[place] == key)[:, None], self._counts[place], 0.0)
+        counts = self._total[state] - own
+        return counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
+
+    def _one_by_one(self, function: Callable) -> np.ndarray:
+        """What a function makes of the demonstrations without each trajectory in turn."""
+        policies = np.zeros_like(self._counts)
+        everyone = np.arange(len(self._demonstrations))
+        for number in np.unique(self._trajectory[self._matters]):
+            own = self._trajectory == number
+            found = function(self._mdp, self._demonstrations[everyone != number])
+            policies[own] = np.asarray(found.policy)[self._state[own]]
+        return policies

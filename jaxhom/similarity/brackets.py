@@ -2,7 +2,8 @@
 
 PDHG decides quickly on which side of a threshold an error lies and takes models of any size; the interior-point method
 needs about ten steps to any tolerance, each with a factorisation of the size of the map. `choose_method` is the one
-place that chooses.
+place that chooses. Decisions of which bounds without iterations (`free_bounds`) or intervals (`propagation`) can be
+sure need neither.
 
 Bounds are widened by the rounding of the sums behind them, which is known beforehand. Where it would take up much of
 the tolerance, as in float32 it does from about ten states on, PDHG runs until its bounds are as close as asked for but
@@ -23,6 +24,8 @@ from jaxhom.similarity.free_bounds import lower_bounds_without_iterations, upper
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import certified_bounds
 from jaxhom.similarity.host_interior_point import seconds_on_host, solve_on_host
+from jaxhom.similarity.model_pairs import ModelPairs
+from jaxhom.similarity.propagation import bounds_by_intervals
 from jaxhom.solvers import pdhg
 from jaxhom.solvers.lane_queue import is_settled, solve_many
 from jaxhom.status import Record, Status
@@ -50,7 +53,7 @@ class LocalSimilarity(Record):
     Attributes:
       lower: [P], lower <= e <= upper for the optimal error e, rounding included.
       upper: [P], likewise.
-      iterations: int32 [P], iterations of the method that settled the pair; 0 where the local models are isomorphic.
+      iterations: int32 [P], iterations of the method that settled the pair; 0 where none was needed.
       status: int32 [P], a `jaxhom.Status`.
     """
 
@@ -122,19 +125,21 @@ def bracket_errors(
     source_labels: np.ndarray | None = None,
     target_labels: np.ndarray | None = None,
     anchored: bool = True,
+    pairs: np.ndarray | None = None,
     goal: Goal = Goal(),  # noqa: B008 (a tuple, it never changes)
     progress: Callable[[int], object] | None = None,
 ) -> LocalSimilarity:
     """Brackets the optimal errors of LP (9) for P pairs of models given as arrays.
 
     Args:
-      source: [P, n, A, n], centre first; padding states have no transitions, and neither have actions that are not
+      source: [S, n, A, n], centre first; padding states have no transitions, and neither have actions that are not
         allowed.
-      target: [P, m, A, m], likewise.
-      source_size, target_size: int [P], how many states are real; all if None.
-      source_labels, target_labels: [P, n, A, L] and [P, m, A, L], finite, zero on padding: e also bounds
+      target: [S', m, A, m], likewise.
+      source_size, target_size: int [S] and [S'], how many states are real; all if None.
+      source_labels, target_labels: [S, n, A, L] and [S', m, A, L], finite, zero on padding: e also bounds
         |l(i,a) - sum_k f(i,k) l'(k,a)|. None where nothing but transitions counts.
       anchored: require that the centre is mapped to the centre.
+      pairs: int [P, 2], numbers of a source and a target each; if None, each source with the target of its number.
       goal: what to settle for.
       progress: called with the number of pairs that just finished.
 
@@ -143,17 +148,27 @@ def bracket_errors(
 
     Source: Boularias and Chaib-draa 2010, eq. (9).
     """
-    labels = (source_labels, target_labels)
-    result = _no_iterations(source, *labels)
+    models = ModelPairs.of(
+        source,
+        target,
+        source_size=source_size,
+        target_size=target_size,
+        source_labels=source_labels,
+        target_labels=target_labels,
+        anchored=anchored,
+        pairs=pairs,
+    )
+    result = _no_iterations(models)
     if goal.decides and anchored:
-        result.lower[:] = lower_bounds_without_iterations(source, target, *labels)
+        result.lower[:] = lower_bounds_without_iterations(models)
     (waiting,) = np.nonzero(~(result.lower > goal.threshold))
     progress = progress or _no_progress
-    progress(len(source) - len(waiting))
+    progress(len(result.lower) - len(waiting))
+    if goal.decides and goal.method == "auto" and waiting.size:
+        waiting = _decide_by_intervals(models, waiting, goal, result, progress)
     for start in range(0, len(waiting), _CHUNK_PAIRS):
         chunk = waiting[start : start + _CHUNK_PAIRS]
-        problem = _problem(chunk, source, target, source_size, target_size, labels, anchored)
-        found = _solve(problem, goal, progress)
+        found = _solve(models.problem(chunk), goal, progress)
         for name in ("lower", "upper", "iterations", "status"):
             getattr(result, name)[chunk] = getattr(found, name)
     return result
@@ -163,16 +178,11 @@ def find_maps(
     source: np.ndarray,
     target: np.ndarray,
     *,
-    source_size: np.ndarray | None = None,
-    target_size: np.ndarray | None = None,
-    source_labels: np.ndarray | None = None,
-    target_labels: np.ndarray | None = None,
-    anchored: bool = True,
     goal: Goal = Goal(),  # noqa: B008
+    **options,
 ) -> tuple[LocalSimilarity, np.ndarray]:
-    """As `bracket_errors`, and the maps that prove the upper bounds: [P, n, m], zero on padding."""
-    labels = (source_labels, target_labels)
-    problem = _problem(slice(None), source, target, source_size, target_size, labels, anchored)
+    """As `bracket_errors`, with its options, and the maps that prove the upper bounds: [P, n, m], zero on padding."""
+    problem = ModelPairs.of(source, target, **options).problem(slice(None))
     if is_small_work(problem):
         near = solve_on_host(problem, goal.tolerance, goal.threshold, _no_progress)
         if goal.is_met(near.lower, near.upper).all():
@@ -182,35 +192,25 @@ def find_maps(
     return found, np.moveaxis(state["best_primal"], -1, 0)
 
 
-def _problem(chunk, source, target, source_size, target_size, labels, anchored: bool) -> HomomorphismProblem:
-    """Some of the pairs, lanes last."""
-
-    def lanes_last(array):
-        return None if array is None else np.moveaxis(array[chunk], 0, -1)
-
-    def sizes(given, models):
-        return (np.full(len(models), models.shape[1]) if given is None else given)[chunk]
-
-    return HomomorphismProblem(
-        source=lanes_last(source),
-        target=lanes_last(target),
-        source_size=sizes(source_size, source),
-        target_size=sizes(target_size, target),
-        anchored=anchored,
-        source_labels=lanes_last(labels[0]),
-        target_labels=lanes_last(labels[1]),
-    )
-
-
-def _no_iterations(source, source_labels, target_labels) -> LocalSimilarity:
+def _no_iterations(models: ModelPairs) -> LocalSimilarity:
     """What holds before anything is computed."""
-    count = len(source)
+    count = len(models.pairs)
     return LocalSimilarity(
-        lower=np.zeros(count, source.dtype),
-        upper=upper_bounds_without_iterations(source, source_labels, target_labels),
+        lower=np.zeros(count, models.dtype),
+        upper=upper_bounds_without_iterations(models),
         iterations=np.zeros(count, np.int32),
         status=np.full(count, Status.SOLVED, np.int32),
     )
+
+
+def _decide_by_intervals(models: ModelPairs, waiting: np.ndarray, goal: Goal, result: LocalSimilarity, progress):
+    """Writes down what intervals find of the pairs that wait, int [W]; those of them that still do."""
+    lower, upper = bounds_by_intervals(models, waiting, goal.threshold, goal.tolerance)
+    result.lower[waiting] = np.maximum(result.lower[waiting], lower)
+    result.upper[waiting] = np.minimum(result.upper[waiting], upper)
+    is_met = goal.is_met(lower, upper)
+    progress(int(is_met.sum()))
+    return waiting[~is_met]
 
 
 def _solve(problem: HomomorphismProblem, goal: Goal, progress) -> LocalSimilarity:

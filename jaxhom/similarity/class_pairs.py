@@ -115,7 +115,6 @@ class ClassPairs:
         """Bounds for different ordered pairs of classes [Q, 2]; a class against itself has an isomorphism."""
         groups = _Groups(pairs, self._models)
         result = self._without_programs(groups)
-        self.num_solved += int(groups.to_solve.sum())
         with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
             bar.update(int((~groups.to_solve).sum()))
             for members, widths in groups.members():
@@ -124,6 +123,7 @@ class ClassPairs:
                     limited = self._limited(goal, widths, _MAX_PRODUCTS)
                     found = bracket_errors(**models, goal=limited, progress=bar.update)
                     jax.tree.map(lambda place, new, index=index: np.put(place, index, new), result, found)
+        self.num_solved += int((result.iterations > 0).sum())
         return result
 
     def map_of(self, pair: np.ndarray, goal: Goal) -> tuple[LocalSimilarity, np.ndarray]:
@@ -179,7 +179,8 @@ class ClassPairs:
 
     def _pair(self, pairs: np.ndarray, widths: tuple[int, int]) -> dict:
         """The models of pairs [Q, 2], as arguments of `bracket_errors`."""
-        source, target = (self._models.of(classes, width) for classes, width in zip(pairs.T, widths, strict=True))
+        different, numbers = zip(*(np.unique(classes, return_inverse=True) for classes in pairs.T), strict=True)
+        source, target = (self._models.of(classes, width) for classes, width in zip(different, widths, strict=True))
         return {
             "source": source.transition,
             "target": target.transition,
@@ -188,6 +189,7 @@ class ClassPairs:
             "source_labels": source.labels,
             "target_labels": target.labels,
             "anchored": self._anchored,
+            "pairs": np.stack(numbers, axis=1),
         }
 
     def renamings(self, pairs: np.ndarray) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 
 _CHUNK_ENTRIES = 2**22  # 32 MB in float64
+_EPS = np.finfo(np.float64).eps
 
 
 def certified_bounds(problem: HomomorphismProblem, f: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,48 +42,55 @@ class Certificate:
     Attributes:
       models: T, T', l and l' of the lanes, these first, in float64; the last two None without labels.
       dtype: of the problem's models.
+      anchored: whether the centre is mapped to the centre.
+      rows: bool [P, n], the states of each source. columns: bool [P, m], those of each target.
+      largest: [P], as `HomomorphismProblem.largest`.
     """
 
     def __init__(self, problem: HomomorphismProblem, lanes: slice | np.ndarray):
         arrays = (problem.source, problem.target, problem.source_labels, problem.target_labels)
         self.models = tuple(None if a is None else _lanes_first(a[..., lanes]) for a in arrays)
-        self.dtype, self._anchored = problem.source.dtype, problem.anchored
-        self._rows = np.arange(self.models[0].shape[1]) < problem.source_size[lanes, None]
-        self._columns = np.arange(self.models[1].shape[1]) < problem.target_size[lanes, None]
-        self._largest = np.broadcast_to(_largest(*self.models[2:]), len(self._rows))
+        self.dtype, self.anchored = problem.source.dtype, problem.anchored
+        self.rows = np.arange(self.models[0].shape[1]) < problem.source_size[lanes, None]
+        self.columns = np.arange(self.models[1].shape[1]) < problem.target_size[lanes, None]
+        self.largest = np.broadcast_to(_largest(*self.models[2:]), len(self.rows))
 
     def part(self, index) -> Certificate:
         """That of some of the lanes."""
         new = object.__new__(Certificate)
         new.models = tuple(None if leaf is None else leaf[index] for leaf in self.models)
-        new.dtype, new._anchored = self.dtype, self._anchored
-        new._rows, new._columns, new._largest = self._rows[index], self._columns[index], self._largest[index]
+        new.dtype, new.anchored = self.dtype, self.anchored
+        new.rows, new.columns, new.largest = self.rows[index], self.columns[index], self.largest[index]
         return new
 
     def feasible(self, f: np.ndarray) -> np.ndarray:
         """The maps [P, n, m] that points f nearly are."""
-        f = np.where(self._rows[:, :, None] & self._columns[:, None], np.maximum(f, 0.0), 0.0)
-        f /= np.where(self._rows, f.sum(axis=2), 1.0)[:, :, None]
-        if self._anchored:
+        f = np.where(self.rows[:, :, None] & self.columns[:, None], np.maximum(f, 0.0), 0.0)
+        f /= np.where(self.rows, f.sum(axis=2), 1.0)[:, :, None]
+        if self.anchored:
             f[:, 0] = np.eye(f.shape[2])[0]
         return f
 
+    def upper(self, f: np.ndarray) -> np.ndarray:
+        """Upper bounds [P] that f [P, n, m], nearly maps, prove; float64."""
+        error = np.abs(forward(*self.models, self.feasible(f))).max(axis=(1, 2, 3))
+        n, m = f.shape[1:]
+        return (error + 2.0 * (n + m + 4) * _EPS * self.largest) * (1.0 + np.finfo(self.dtype).eps)
+
     def bounds(self, f: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds [P], from f [P, n, m], nearly maps, and y [P, n, A, m + L], any; float64."""
-        rows, columns, f = self._rows, self._columns, self.feasible(f)
+        rows, columns = self.rows, self.columns
         y = y / np.maximum(np.abs(y).sum(axis=(1, 2, 3)), 1.0)[:, None, None, None]
-        error = np.abs(forward(*self.models, f)).max(axis=(1, 2, 3))
         slopes = np.where(columns[:, None], adjoint(*self.models, y), np.inf)
         lowest = slopes.min(axis=2)
-        if self._anchored:
+        if self.anchored:
             lowest[:, 0] = slopes[:, 0, 0]
         value = np.where(rows, lowest, 0.0).sum(axis=1)
         (_, n, num_actions, width), m = y.shape, f.shape[2]
         terms = num_actions * (n + 2 * width) + 2 * n + 2 * m + 8  # as in `HomomorphismProblem.rounding`, with room
-        rounding = terms * np.finfo(np.float64).eps * self._largest
+        rounding = terms * _EPS * self.largest
         outward = np.finfo(self.dtype).eps  # of the conversion to the dtype of the models
-        upper = (error + rounding) * (1.0 + outward)
-        return np.maximum(value - rounding, 0.0) * (1.0 - outward), upper
+        return np.maximum(value - rounding, 0.0) * (1.0 - outward), self.upper(f)
 
 
 def forward(source, target, source_labels, target_labels, f) -> np.ndarray:

@@ -167,11 +167,11 @@ def test_one_table_of_decisions_serves_many_demonstrations():
     here = world("grid")
     shared = SimilarityTable(here.mdp)
     first = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3, table=shared)
-    solved = shared.num_solved
-    assert solved > 0
+    solved, met = shared.num_solved, len(shared.known()[0])
+    assert met > 0
     with pytest.warns(DeprecationWarning, match="similarity is now called table"):
         again = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3, similarity=shared)
-    assert shared.num_solved == solved
+    assert shared.num_solved == solved and len(shared.known()[0]) == met
     with pytest.warns(DeprecationWarning), pytest.raises(ValueError, match="give one of them"):
         soft_local_homomorphism(here.mdp, here.demonstrations, table=shared, similarity=shared)
     alone = soft_local_homomorphism(here.mdp, here.demonstrations, threshold=0.3)

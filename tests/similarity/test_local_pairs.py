@@ -266,7 +266,7 @@ def test_chunks_of_pairs(monkeypatch):
     bracket_errors = class_pairs.bracket_errors
 
     def recorded(source, target, **options):
-        calls.append(len(source))
+        calls.append(len(options["pairs"]))
         return bracket_errors(source, target, **options)
 
     monkeypatch.setattr(class_pairs, "_CHUNK_BYTES", 5000)
@@ -349,7 +349,7 @@ def test_decisions_stop_early():
     decided.decide(*pairs, 0.9, tolerance=1e-5)
     # Read without solving: the bounds of the decisions are within a gap of 2.
     assert decided.brackets(*pairs, tolerance=2.0).iterations.mean() < 0.5 * steps
-    assert decided.num_solved == open_.num_solved
+    assert 0 < decided.num_solved <= open_.num_solved
 
 
 # ------------------------------------------------------------------------------ what is refused

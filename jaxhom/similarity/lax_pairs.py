@@ -11,12 +11,14 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom.similarity.canonical_forms import canonical_forms
 from jaxhom.similarity.class_pairs import ClassModels, ClassPairs
-from jaxhom.similarity.local_models import LocalModels
+from jaxhom.similarity.classes import quantum_bits
+from jaxhom.similarity.local_models import LocalModels, is_oversized
+from jaxhom.similarity.pair_bounds import PairBounds, pair_set
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -49,7 +51,7 @@ class LaxPairs:
             )
         orders = list(itertools.permutations(range(num_actions)))
         self._orders = np.array(sorted(orders, key=lambda order: sum(a != b for a, b in enumerate(order))), np.int32)
-        self._anchored, self._models = anchored, models
+        self._anchored, self._models, self._actions = anchored, models, _Actions(models)
         self._programs = ClassPairs(_RenamedModels(models, self._orders), anchored)
         self._chosen: dict[tuple[int, int], int] = {}
 
@@ -60,8 +62,7 @@ class LaxPairs:
 
     def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, *, progress: bool = False) -> LocalSimilarity:
         """Bounds on the least errors of different ordered pairs of classes."""
-        free = self._free_bounds(pairs)
-        lower, best = free.copy(), np.full(len(pairs), np.inf)
+        lower, best = self._bounds_by_actions(pairs, goal), np.full(len(pairs), np.inf)
         chosen_upper, chosen = np.full(len(pairs), np.inf), np.zeros(len(pairs), int)
         iterations, status = np.zeros(len(pairs), np.int32), np.full(len(pairs), Status.SOLVED, np.int32)
         for rank in range(len(self._orders)):
@@ -113,35 +114,72 @@ class LaxPairs:
         """The pairs with the actions of the targets renamed, as `_RenamedModels` numbers them."""
         return pairs + np.array([0, rank * len(self._models.size)])
 
-    def _free_bounds(self, pairs) -> Float[np.ndarray, "Q R"]:
-        """What the centres alone say of every permutation; 0 where they may be mapped elsewhere."""
-        if not self._anchored:
-            return np.zeros((len(pairs), len(self._orders)))
+    def _bounds_by_actions(self, pairs, goal: Goal) -> Float[np.ndarray, "Q R"]:
+        """Lower bounds for every permutation: no error is below that of any one action with the one renamed to it."""
         result, actions = np.zeros((len(pairs), len(self._orders))), np.arange(self._orders.shape[1])
-        for index, source, target in self._models.of_pairs(pairs):
-            for part in np.array_split(np.arange(len(index)), 1 + len(index) * self._orders.size // _CHUNK):
-                apart = _centre_errors(
-                    *(jax.tree.map(lambda leaf, part=part: leaf[part], side) for side in (source, target))
-                )
-                result[index[part]] = apart[:, actions, self._orders].max(axis=2)
+        if not self._anchored:  # a single action then has little to say
+            return result
+        apart = self._actions.errors(pairs, goal._replace(threshold=goal.threshold if goal.decides else 0.0))
+        for part in np.array_split(np.arange(len(pairs)), 1 + result.size * len(actions) // _CHUNK):
+            result[part] = apart[part][:, actions, self._orders].max(axis=2)
         return result
 
 
-def _centre_errors(source: LocalModels, target: LocalModels) -> Float[np.ndarray, "Q A A"]:
-    """Lower bounds on the error where an action of the target stands for one of the source, from the centres' rows.
+class _Actions:
+    """Lower bounds on the errors of LP (9) for one action of the source and one of the target, as if there were no more.
 
-    As `free_bounds`: what stays can only gain from maps of the other states, what leaves is all that can arrive.
+    Args:
+      models: those that stand for the classes.
     """
-    own, other = (np.asarray(side.transition[:, 0], float) for side in (source, target))
-    apart = own[:, :, None, 0] - other[:, None, :, 0]
-    arrives = other[:, :, 1:].max(axis=2, initial=-1.0)
-    apart = np.maximum(apart, arrives[:, None] - own[:, :, 1:].sum(axis=2)[:, :, None])
-    apart -= (8.0 + own.shape[2]) * np.finfo(own.dtype).eps
-    if source.labels is not None:
-        own, other = (np.asarray(side.labels[:, 0], float) for side in (source, target))
-        of_labels = np.abs(own[:, :, None] - other[:, None]).max(axis=3, initial=0.0)
-        apart = np.maximum(apart, of_labels * (1.0 - 4.0 * np.finfo(float).eps))
-    return np.maximum(apart, 0.0)
+
+    def __init__(self, models: ClassModels):
+        self._models, self._programs = models, ClassPairs(_SingleActions(models), True)
+        self._known, self._number_of_key = PairBounds(models.dtype), {}
+        self._alike = np.zeros((0, models.num_actions), int)  # of each class and action: one that is the same
+
+    def errors(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal) -> Float[np.ndarray, "Q A A"]:
+        """Lower bounds that decide as far as the goal asks for."""
+        self._meet()
+        own, other = (self._alike[side] for side in pairs.T)
+        asked = np.stack(np.broadcast_arrays(own[:, :, None], other[:, None]), axis=-1)
+        different = pair_set(asked.reshape(-1, 2))
+        known = self._known.look_up(different)
+        open_ = different[~goal.is_met(known.lower, known.upper) & ~self._known.was_tried(different, goal)]
+        if len(open_):
+            self._known.add(open_, self._programs.brackets(open_, goal), goal)
+        return self._known.look_up(asked.reshape(-1, 2)).lower.reshape(asked.shape[:-1])
+
+    def _meet(self) -> None:
+        """Finds out which actions of new classes are the same as others, up to a renaming of states."""
+        for number in range(len(self._alike), len(self._models.size)):
+            row = np.arange(self._models.num_actions) + number * self._models.num_actions
+            if not is_oversized(self._models.size[number], self._models.num_actions):
+                model = self._models.alone(number, most=1.0)
+                labels = None if model.labels is None else np.moveaxis(model.labels, 1, 0)[:, :, None]
+                singles = np.moveaxis(model.transition, 1, 0)[:, :, None]
+                keys, _ = canonical_forms(singles, quantum_bits(self._models.dtype), labels)
+                row = [self._number_of_key.setdefault(key, int(v)) for key, v in zip(keys, row, strict=True)]
+            self._alike = np.append(self._alike, [row], axis=0)
+
+
+class _SingleActions(ClassModels):
+    """The models of C classes with one of A actions each: class c A + a."""
+
+    def __init__(self, models: ClassModels):
+        vars(self).update(vars(models))
+        self._plain, self.num_actions = models, 1
+
+    @property
+    def size(self) -> np.ndarray:
+        return np.repeat(self._plain.size, self._plain.num_actions)
+
+    def of(self, classes: np.ndarray, width: int) -> LocalModels:
+        number, action = np.divmod(classes, self._plain.num_actions)
+        models, chosen = self._plain.of(number, width), action[:, None, None, None]
+        return models.replace(
+            transition=np.take_along_axis(models.transition, chosen, axis=2),
+            labels=None if models.labels is None else np.take_along_axis(models.labels, chosen, axis=2),
+        )
 
 
 class _RenamedModels(ClassModels):

@@ -37,7 +37,7 @@ _METRICS = {
     "off_roads": "off-roads per step",
     "ratio": "reward per step / expert's",
 }
-_DOMAINS = {"track_a": "racetrack (a)", "track_b": "racetrack (b)", "track_corner": "corner track"}
+_DOMAINS = {"track_a": "racetrack (a)", "track_b": "racetrack (b)", "track_corner": "corner track", "road": "roads"}
 
 
 def figure1(lines: pd.DataFrame) -> Figure:
@@ -116,10 +116,41 @@ def normalisation_figure(lines: pd.DataFrame) -> Figure:
     return _with_legend(figure, columns=3)
 
 
+def relations_figure(lines: pd.DataFrame) -> Figure:
+    """Percent of the expert's reward, a row per method, a column per setting; coloured by the difference to LP (9)."""
+    lines = _pick(lines, metric="ratio")
+    methods = [name for name in lines["method"].unique() if name != "expert"]
+    columns = list(dict.fromkeys(zip(lines["domain"], lines["demonstrations"], strict=True)))
+    cells = lines.set_index(["method", "domain", "demonstrations"])
+    index = pd.MultiIndex.from_tuples([(name, *column) for name in methods for column in columns])
+    table, high = (
+        100.0 * cells[name].reindex(index).to_numpy(float).reshape(len(methods), -1) for name in ("mean", "ci_high")
+    )
+    half = high - table
+    base = table[methods.index("homomorphism 0")]
+    figure, panels = _panels(1, 1, (2.6 + 0.72 * len(columns), 1.6 + 0.3 * len(methods)))
+    ax = panels[0, 0]
+    image = ax.imshow(table - base, cmap="PuOr_r", vmin=-20.0, vmax=20.0, aspect="auto")
+    for (row, column), value in np.ndenumerate(table):
+        if not np.isfinite(value):
+            continue
+        difference = value - base[column]
+        is_clear = abs(difference) > np.hypot(half[row, column], half[methods.index("homomorphism 0"), column])
+        color = "white" if abs(difference) > 14.0 else BLACK
+        weight = "bold" if is_clear else "normal"
+        ax.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=7, color=color, fontweight=weight)
+    names = [f"{domain_name(domain)}\n{count}" for domain, count in columns]
+    ax.set_xticks(range(len(columns)), names, fontsize=7, rotation=90)
+    ax.set_yticks(range(len(methods)), methods, fontsize=8)
+    ax.set_xlabel("domain, number of demonstrations")
+    figure.colorbar(image, ax=ax, label="points above Algorithm 1 at threshold 0", extend="both", fraction=0.03)
+    return figure
+
+
 def domain_name(domain: str) -> str:
     """A domain for people."""
-    size = domain.removeprefix("grid")
-    return _DOMAINS.get(domain, f"gridworld {size} x {size}")
+    kind, size = domain.rstrip("0123456789"), domain.lstrip("abcdefghijklmnopqrstuvwxyz_")
+    return _DOMAINS.get(domain, f"{'lake' if kind == 'lake' else 'gridworld'} {size} x {size}")
 
 
 def _draw_methods(ax: Axes, lines: pd.DataFrame, x: str, metric: str) -> None:

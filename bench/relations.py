@@ -21,12 +21,16 @@ from bench.settings import track
 from jaxhom.generalization.choice import default_candidates
 
 _POOL = 30  # trajectories that are drawn on the first track
-_LABELS = " labels"
+_LABELS = ", labels"
 
 _RELATIONS: dict[str, dict[str, Any]] = {
     f"{relation} {threshold:g}": {"relation": relation, "threshold": threshold}
     for relation in jaxhom.similarity.relations.RELATIONS
     for threshold in ((0.0,) if relation == "isomorphic" else (0.0, 0.1, 0.2))
+}
+_EVERYBODY: dict[str, dict[str, Any]] = {
+    f"{relation} all, weighted": {"relation": relation, "threshold": 1.0, "voters": "all", "weights": "similarity"}
+    for relation in ("homomorphism", "random_walk")
 }
 _VOTERS: dict[str, dict[str, Any]] = {
     "homomorphism 0, 3 voters": {"voters": 3},
@@ -34,7 +38,7 @@ _VOTERS: dict[str, dict[str, Any]] = {
     "isomorphic 0, all": {"relation": "isomorphic", "voters": "all"},
     "lax 0, all": {"relation": "lax", "voters": "all"},
     "homomorphism 0.2, weighted": {"threshold": 0.2, "weights": "similarity"},
-    "homomorphism 0.5, all, weighted": {"threshold": 0.5, "voters": "all", "weights": "similarity"},
+    **_EVERYBODY,
 }
 
 
@@ -43,27 +47,19 @@ def related(problem: Problem, *, is_labelled: bool = False, **options) -> Learne
     return soft(problem, **options, **({"labels": problem.domain.labels} if is_labelled else {}))
 
 
-def chosen(problem: Problem, *, is_labelled: bool = False) -> Learned:
-    """The choice among the default candidates, and with labels those that have them too; tables are shared by draws."""
-    domain, setting = problem.domain, problem.setting
-    candidates = _with_tables(setting.domain, default_candidates(domain.bare), is_labelled)
+def chosen(problem: Problem, *, is_labelled: bool = False, caution: float | None = None) -> Learned:
+    """The choice among the default candidates, with the labels of the domain; tables are shared by draws."""
+    domain, name = problem.domain, problem.setting.domain
+    labels = domain.labels if is_labelled else None
+    candidates = default_candidates(domain.bare, is_labelled)
+    for key, one in candidates.items():
+        if isinstance(one, Mapping):
+            candidates[key] = {**one, "table": shared_table(name, 1, is_labelled, relation=one["relation"])}
     states = None if domain.terminal is None else ~np.asarray(domain.terminal)
     pairs = zip(problem.models, problem.demonstrations, strict=True)
-    found = [jaxhom.choose_generalization(*pair, candidates, states=states).best for pair in pairs]
-    status = [0 if one.status is None else int(one.status) for one in found]
-    return Learned(jnp.stack([one.policy for one in found]), np.array(status))
-
-
-def _with_tables(domain: str, candidates: Mapping[str, Any], is_labelled: bool) -> dict[str, Any]:
-    result = dict(candidates)
-    for with_labels in (False, True)[: 1 + is_labelled]:
-        labels = build_domain(domain, 1 if domain.startswith("grid") else 0).labels if with_labels else None
-        others = _VOTERS if with_labels else {}
-        for name, one in ({**candidates, **others}).items():
-            if isinstance(one, Mapping):
-                table = shared_table(domain, 1, with_labels, relation=one.get("relation", "homomorphism"))
-                result[name + _LABELS * with_labels] = {**one, "labels": labels, "table": table}
-    return result
+    options = {"labels": labels, "states": states} | ({} if caution is None else {"caution": caution})
+    found = [jaxhom.choose_generalization(*pair, candidates, **options).best for pair in pairs]
+    return Learned(jnp.stack([one.policy for one in found]), np.array([int(one.status) for one in found]))
 
 
 def smallest_label(problem: Problem) -> Learned:
@@ -113,8 +109,14 @@ def _methods(chosen_ones: Mapping[str, Mapping[str, Any]], **more) -> dict[str, 
     return {name + suffix: functools.partial(related, **options, **more) for name, options in chosen_ones.items()}
 
 
+def _choices(**options) -> dict[str, Method]:
+    """The choice by default, and that of the highest score."""
+    bold = functools.partial(chosen, caution=0.0, **options)
+    return {"chosen": functools.partial(chosen, **options), "chosen, highest score": bold}
+
+
 _CONTROLS: dict[str, Method] = {"expert": expert, "uniform": maximum_entropy, "k-NN": manhattan_knn}
-WITHOUT_LABELS: dict[str, Method] = {**_CONTROLS, **_methods(_RELATIONS), **_methods(_VOTERS), "chosen": chosen}
+WITHOUT_LABELS: dict[str, Method] = {**_CONTROLS, **_methods(_RELATIONS), **_methods(_VOTERS), **_choices()}
 """On models without labels."""
 WITH_LABELS: dict[str, Method] = {
     **_CONTROLS,
@@ -123,9 +125,14 @@ WITH_LABELS: dict[str, Method] = {
     **_methods(_VOTERS),
     **_methods(_RELATIONS, is_labelled=True),
     **_methods(_VOTERS, is_labelled=True),
-    "chosen": functools.partial(chosen, is_labelled=True),
+    **_choices(is_labelled=True),
 }
 """On models with labels, with and without them."""
+CANDIDATES = {
+    "relations": [*_CONTROLS, *_RELATIONS],
+    "roads": [*_CONTROLS, *(name + _LABELS for name in (*_RELATIONS, *_EVERYBODY))],
+}
+"""What is chosen from, but for the expert; by sweep."""
 ACROSS: dict[str, Method] = {
     "expert": expert,
     "uniform": lambda problem: Learned(jnp.full_like(problem.expert.policy, 1.0 / problem.expert.policy.shape[-1])),

@@ -138,7 +138,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "help": "who votes: nearest (default), all, or a number of the nearest at least",
     },
     "weights": {"choices": WEIGHTS, "help": "of votes (default equal)"},
-    "temperature": {"type": float, "metavar": "T", "help": "of weights by similarity (default 0.1)"},
+    "temperature": {"type": float, "metavar": "T", "help": "of weights by similarity (default 0.05)"},
     "max_iterations": {"type": positive, "metavar": "N", "help": "of the global program (default 20000)"},
     "metric": {
         "choices": ("hops", "euclidean"),

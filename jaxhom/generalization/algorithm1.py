@@ -45,7 +45,7 @@ def soft_local_homomorphism(
     relation: str | UserRelation = "homomorphism",
     voters: str | int = "nearest",
     weights: str = "equal",
-    temperature: float = 0.1,
+    temperature: float = 0.05,
     tolerance: float = 1e-4,
     states: Bool[ArrayLike, " S"] | None = None,
     table: SimilarityTable | None = None,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -28,7 +28,6 @@ from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP, absorbing_states, uniform_policy
 from jaxhom.similarity.given_table import table_for
 from jaxhom.similarity.lax_pairs import MAX_ACTIONS
-from jaxhom.similarity.relations import RELATIONS
 from jaxhom.similarity.table import SimilarityTable
 from jaxhom.status import Record
 
@@ -39,6 +38,7 @@ Candidate = Mapping[str, Any] | Callable[[MDP, Demonstrations], Generalization]
 
 _THRESHOLDS = (0.0, 0.1, 0.2)
 _LITTLE = 0.05
+_ROUNDING = 1e-12
 _MIXINGS = np.geomspace(0.01, 1.0, 33)
 _OF_TABLE = ("distance", "anchored", "labels", "label_weight", "relation")
 _OF_RULE = tuple(field.name for field in dataclasses.fields(VotingRule))
@@ -50,8 +50,7 @@ class Choice(Record):
     Attributes:
       best: the winner, fitted to all demonstrations.
       name: its name.
-      scores: by name, the mean log-likelihood of a step that was left out, in nats; the highest wins, of equal ones the
-        first.
+      scores: by name, the mean log-likelihood of a step that was left out, in nats.
       standard_errors: by name, those of the scores, from the spread between trajectories.
     """
 
@@ -71,26 +70,31 @@ def choose_generalization(
     label_weight: float = 1.0,
     states: Bool[ArrayLike, " S"] | None = None,
     mixing: float | None = None,
+    caution: float = 2.0,
     progress: bool = False,
 ) -> Choice:
     """Chooses among ways to generalize by the likelihood of trajectories that were left out.
 
     Each trajectory is left out in turn. A candidate's score is the mean, over all their steps, of log((1 - mixing)
-    pi(s, a) + mixing u(s, a)): pi is what it makes of the others, u is uniform over the allowed actions.
+    pi(s, a) + mixing u(s, a)): pi is what it makes of the others, u is uniform over the allowed actions. The winner is
+    the first candidate whose score is not told from the highest one: within so many standard errors, those of the
+    difference between trajectories, as `caution` says. A few trajectories tell little, so those come first that accept
+    least.
 
     Args:
       mdp: the model.
       demonstrations: M >= 2 trajectories with steps.
       candidates: by name, the options of `soft_local_homomorphism` as a mapping; or a function of a model and
         demonstrations, such as `nearest_neighbors`, `uniform_elsewhere` or one of the user's. `default_candidates` says
-        which if None: LP (9), Weisfeiler-Lehman, random walks and, for up to 6 actions, "lax" at three thresholds,
-        isomorphism, k-NN, and uniform.
+        which if None: isomorphism, and Weisfeiler-Lehman, LP (9), random walks and, for up to 6 actions, "lax" at three
+        thresholds, k-NN, and uniform; with labels also LP (9) and random walks with all voters, weighted.
       distance, labels, label_weight, states: what `soft_local_homomorphism` takes, for candidates that do not say
         otherwise. Steps in states that are left out do not count.
       mixing: in (0, 1], the share of the uniform policy, without which one wrong step would decide. If None each
         candidate has the share, from 1 % on, under which it is likeliest: with little of it one that is right in half
         of the states, which may be by far the best, would score below `uniform_elsewhere`. In states that other
         trajectories visit too, where there is nothing to generalize, it is 5 %.
+      caution: at least 0, see above; with 0 the highest score wins.
       progress: show a progress bar.
 
     Returns:
@@ -115,41 +119,53 @@ def choose_generalization(
       >>> choice.best.policy.shape
       (36, 4)
 
-    Source: cross-validation of Stone 1974, by trajectories.
+    Source: cross-validation (Stone 1974) by trajectories, with the rule of standard errors of Breiman, Friedman, Olshen
+    and Stone 1984.
     """
     mdp = as_model(mdp)
     if checks.is_traced(mdp, demonstrations):
         raise ValueError("candidates are compared on the host: call choose_generalization outside jit, vmap and grad")
-    checks.refuse_traced(mixing=mixing)
+    checks.refuse_traced(mixing=mixing, caution=caution)
+    if not caution >= 0:
+        raise ValueError(f"caution must not be negative, got {caution}")
     if mixing is not None and not 0 < mixing <= 1:
         raise ValueError(f"mixing must lie in (0, 1], got {mixing}")
     shared = {"distance": distance, "labels": labels, "label_weight": label_weight, "states": states}
     if candidates is None:
-        candidates = default_candidates(mdp)
+        candidates = default_candidates(mdp, labels is not None)
     if not isinstance(candidates, Mapping) or not candidates:
         raise ValueError("candidates must be a mapping that is not empty, from names to options or functions")
     left_out, tables = _LeftOut(mdp, demonstrations, states), _Tables(mdp)
     known = {name: _checked(name, candidate, shared) for name, candidate in candidates.items()}
-    scores, errors = {}, {}
+    scores = {}
     for name, candidate in tqdm(known.items(), desc="candidates", leave=False, disable=not progress):
-        policies = left_out.policies(candidate, tables, progress)
-        scores[name], errors[name] = left_out.score(policies, mixing)
-    name = max(scores, key=scores.__getitem__)
+        scores[name] = left_out.score(left_out.policies(candidate, tables, progress), mixing)
+    highest = max(scores.values(), key=lambda score: score.mean)
+    name = next(name for name, score in scores.items() if highest.ahead_of(score) <= caution)
     best = known[name]
     if isinstance(best, dict):
         options = {**best, "table": tables.of(best), "progress": progress}
         best = functools.partial(soft_local_homomorphism, **options)
-    return Choice(best=best(mdp, demonstrations), name=name, scores=scores, standard_errors=errors)
+    return Choice(
+        best=best(mdp, demonstrations),
+        name=name,
+        scores={key: score.mean for key, score in scores.items()},
+        standard_errors={key: score.error for key, score in scores.items()},
+    )
 
 
-def default_candidates(mdp: MDP) -> dict[str, Candidate]:
+def default_candidates(mdp: MDP, has_labels: bool = False) -> dict[str, Candidate]:
     """What is chosen from if nothing else is said: strict relations first, k-NN and uniform last."""
     chosen: dict[str, Candidate] = {}
-    for relation in RELATIONS:
+    for relation in ("isomorphic", "weisfeiler_lehman", "homomorphism", "random_walk", "lax"):
         if relation == "lax" and as_model(mdp).num_actions > MAX_ACTIONS:
             continue
         for threshold in _THRESHOLDS[: 1 if relation == "isomorphic" else None]:
             chosen[f"{relation} {threshold:g}"] = {"relation": relation, "threshold": threshold}
+    if has_labels:
+        everybody = {"threshold": 1.0, "voters": "all", "weights": "similarity"}
+        for relation in ("homomorphism", "random_walk"):
+            chosen[f"{relation} all, weighted"] = {"relation": relation, **everybody}
     return chosen | {"k-NN": nearest_neighbors, "uniform": uniform_elsewhere}
 
 
@@ -189,6 +205,30 @@ class _Tables:
         if key not in self._known:
             self._known[key] = SimilarityTable(self._mdp, **kind)
         return self._known[key]
+
+
+class _Score(NamedTuple):
+    """The log-likelihoods of M trajectories, and how many steps of each count, [M]."""
+
+    log: np.ndarray
+    length: np.ndarray
+
+    @property
+    def mean(self) -> float:
+        """Of a step."""
+        return float(self.log.sum() / self.length.sum())
+
+    @property
+    def error(self) -> float:
+        """The standard error of the mean, from the spread between trajectories."""
+        count = len(self.log)
+        spread = ((self.log - self.mean * self.length) ** 2).sum() * count / (count - 1)
+        return float(np.sqrt(spread) / self.length.sum())
+
+    def ahead_of(self, other: _Score) -> float:
+        """By how many standard errors of the difference; none where there is no difference but rounding."""
+        difference = _Score(self.log - other.log, self.length)
+        return 0.0 if difference.mean <= _ROUNDING else difference.mean / max(difference.error, _ROUNDING)
 
 
 class _LeftOut:
@@ -238,16 +278,14 @@ class _LeftOut:
         policies[is_alone] = elected[self._state[is_alone]]
         return policies
 
-    def score(self, policies: np.ndarray, mixing: float | None) -> tuple[float, float]:
-        """The mean log-likelihood of a step, and its standard error."""
+    def score(self, policies: np.ndarray, mixing: float | None) -> _Score:
+        """The log-likelihood of the steps that matter."""
         shares = _MIXINGS if mixing is None else [mixing]
         log = max((self._log_likelihoods(policies, share) for share in shares), key=np.sum)
         steps = self._counts[self._matters].sum(axis=1)
         number = self._trajectory[self._matters]
-        of_trajectory, length = np.bincount(number, log), np.bincount(number, steps)
-        mean, count = log.sum() / steps.sum(), (length > 0).sum()
-        spread = ((of_trajectory - mean * length) ** 2).sum() * count / (count - 1)
-        return float(mean), float(np.sqrt(spread) / length.sum())
+        length = np.bincount(number, steps)
+        return _Score(np.bincount(number, log)[length > 0], length[length > 0])
 
     def _log_likelihoods(self, policies: np.ndarray, share: float) -> np.ndarray:
         """Of each visit that matters."""

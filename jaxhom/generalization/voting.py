@@ -42,7 +42,7 @@ class VotingRule:
     tolerance: float = 1e-4
     voters: str | int = "nearest"
     weights: str = "equal"
-    temperature: float = 0.1
+    temperature: float = 0.05
 
     def __post_init__(self) -> None:
         checks.refuse_traced(**dataclasses.asdict(self))

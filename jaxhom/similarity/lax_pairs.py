@@ -126,7 +126,7 @@ class LaxPairs:
 
 
 class _Actions:
-    """Lower bounds on the errors of LP (9) for one action of the source and one of the target, as if there were no more.
+    """Lower bounds on the errors of LP (9) for single actions of the source and the target, as if there were no more.
 
     Args:
       models: those that stand for the classes.

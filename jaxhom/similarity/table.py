@@ -6,7 +6,10 @@ same table, and bounds that were found for one threshold serve every other.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import functools
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import numpy as np
@@ -37,7 +40,20 @@ from jaxhom.solvers.lane_queue import is_settled
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Int, Num
 
+F = TypeVar("F", bound=Callable)
+
 _MAP_TOLERANCE = {"float64": 1e-6, "float32": 1e-4}  # below what an explanation prints
+
+
+def _one_at_a_time(method: F) -> F:
+    """A method of a table, which several threads may share: they wait for one another."""
+
+    @functools.wraps(method)
+    def call(self, *args, **options):
+        with self._lock:
+            return method(self, *args, **options)
+
+    return call
 
 
 class SimilarityTable:
@@ -73,8 +89,9 @@ class SimilarityTable:
     Raises:
       ValueError: if the model is traced, an option out of range, or labels do not fit.
 
-    The table grows by what it is asked; it belongs to the host and is no pytree. It takes concrete values alone, inside
-    jit, vmap and grad too. Completed, it answers for traced demonstrations: see `complete`.
+    The table grows by what it is asked; it belongs to the host and is no pytree. Threads may share it. It takes
+    concrete values alone, inside jit, vmap and grad too. Completed, it answers for traced demonstrations: see
+    `complete`.
 
     Example:
       >>> import jaxhom
@@ -110,6 +127,7 @@ class SimilarityTable:
         self._book = ClassBook(self._maker)
         self._pairs = pair_errors(relation, ClassModels(self._maker, self._book), self.anchored)
         self._known = PairBounds(self.mdp.dtype)
+        self._lock = threading.RLock()
         self._maps: dict[tuple[int, int], tuple[np.ndarray, LocalSimilarity]] = {}
 
     def __repr__(self) -> str:
@@ -148,6 +166,7 @@ class SimilarityTable:
         return self._pairs.num_solved
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def classes(self, states: Int[ArrayLike, " P"] | None = None) -> np.ndarray:
         """int32 [P]: the class of the local model of each of the given states, all states if None.
 
@@ -158,6 +177,7 @@ class SimilarityTable:
         return self._book.labels(check_states(self.mdp, states))
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def brackets(
         self,
         sources: Int[ArrayLike, " P"],
@@ -179,6 +199,7 @@ class SimilarityTable:
         return jax.tree.map(lambda leaf: leaf[where], self._widened(pairs, goal))
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def decide(
         self,
         sources: Int[ArrayLike, " P"],
@@ -198,6 +219,7 @@ class SimilarityTable:
         return self.decisions(sources, targets, threshold, **options).similar
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def decisions(
         self,
         sources: Int[ArrayLike, " P"],
@@ -230,6 +252,7 @@ class SimilarityTable:
         return jax.tree.map(lambda leaf: leaf[where], found)
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def complete(
         self, threshold: float = 0.0, *, tolerance: float = 1e-4, with_errors: bool = False, progress: bool = False
     ) -> SimilarityTable:
@@ -265,6 +288,7 @@ class SimilarityTable:
         return self
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def relation(
         self, threshold: float = 0.0, *, mutual: bool = False, tolerance: float = 1e-4, with_errors: bool = False
     ) -> Relation:
@@ -305,6 +329,7 @@ class SimilarityTable:
         return relation
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def renamings(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> np.ndarray | None:
         """int [P, A]: which action of the target stands for each of the source's; None where each is itself.
 
@@ -319,6 +344,7 @@ class SimilarityTable:
         return None if found is None else found[where]
 
     @checks.eager_where_concrete
+    @_one_at_a_time
     def maps(self, sources: Int[ArrayLike, " P"], targets: Int[ArrayLike, " P"]) -> CertifiedMaps:
         """Maps M^{s,d} to M^{s',d} for pairs (s, s') of states, each with as small an error as can be certified.
 
@@ -361,6 +387,7 @@ class SimilarityTable:
             jax.tree.map(lambda leaf: leaf[where], bounds),
         )
 
+    @_one_at_a_time
     def known(self) -> tuple[np.ndarray, LocalSimilarity]:
         """All pairs of classes that were asked for, int [Q, 2], and the bounds on their errors, [Q].
 

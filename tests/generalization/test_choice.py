@@ -84,7 +84,7 @@ def test_scores_are_those_of_fits_without_each_trajectory(name):
         key: {k: labels if k == "labels" else v for k, v in one.items()} if isinstance(one, dict) else one
         for key, one in CANDIDATES.items()
     }
-    chosen = choose_generalization(mdp, demonstrations, candidates, mixing=0.1)
+    chosen = choose_generalization(mdp, demonstrations, candidates, mixing=0.1, caution=0)
     fits = {
         key: functools.partial(soft_local_homomorphism, **one) if isinstance(one, dict) else one
         for key, one in candidates.items()
@@ -97,7 +97,7 @@ def test_scores_are_those_of_fits_without_each_trajectory(name):
     assert chosen.best.explain(0).state == 0
     # Functions that are called once for each trajectory say the same.
     one_by_one = {key: functools.partial(lambda m, d, f: f(m, d), f=function) for key, function in fits.items()}
-    again = choose_generalization(mdp, demonstrations, one_by_one, mixing=0.1)
+    again = choose_generalization(mdp, demonstrations, one_by_one, mixing=0.1, caution=0)
     for key in fits:
         np.testing.assert_allclose(again.scores[key], chosen.scores[key], atol=2e-4)
         np.testing.assert_allclose(again.standard_errors[key], chosen.standard_errors[key], atol=1e-3)
@@ -127,7 +127,20 @@ def test_what_generalizes_wins_over_what_does_not():
     ]
     chosen = choose_generalization(grid, Demonstrations.from_trajectories(walks))
     assert chosen.scores[chosen.name] > chosen.scores["k-NN"] > chosen.scores["uniform"]
-    assert "homomorphism" in chosen.name and "Choice(" in repr(chosen)
+    assert chosen.name not in ("k-NN", "uniform") and "Choice(" in repr(chosen)
+
+
+@pytest.mark.parametrize("name", ["grid", "track", "random"])
+def test_caution_prefers_what_comes_first(name):
+    """By the standard error of the difference, trajectory by trajectory."""
+    mdp, demonstrations = world(name)
+    candidates = {"uniform": uniform_elsewhere, "lax": {"relation": "lax"}, "plain": {}, "k-NN": nearest_neighbors}
+    bold = choose_generalization(mdp, demonstrations, candidates, caution=0.0)
+    assert bold.scores[bold.name] == max(bold.scores.values())
+    assert choose_generalization(mdp, demonstrations, candidates, caution=1e9).name == "uniform"
+    names = [choose_generalization(mdp, demonstrations, candidates, caution=c).name for c in (0.0, 0.5, 1.0, 2.0, 4.0)]
+    places = [list(candidates).index(found) for found in names]
+    assert places == sorted(places, reverse=True)
 
 
 def test_states_that_are_left_out_do_not_count():
@@ -141,7 +154,7 @@ def test_states_that_are_left_out_do_not_count():
 
 def test_default_candidates():
     names = list(default_candidates(gridworld(3)))
-    assert names[0] == "homomorphism 0" and names[-2:] == ["k-NN", "uniform"] and len(names) == 15
+    assert names[0] == "isomorphic 0" and names[-2:] == ["k-NN", "uniform"] and len(names) == 15
     many = MDP.from_dense(np.ones((2, 7, 2)) / 2, discount=0.9)
     assert not any("lax" in name for name in default_candidates(many))
 
@@ -163,6 +176,7 @@ HIDDEN = HIDDEN.replace(mask=HIDDEN.mask & (np.arange(2) == 0)[:, None])
         (None, {"odd": {"voters": "some"}}, {}, r"candidates\['odd'\]: voters must be"),
         (None, {"odd": 3}, {}, r"candidates\['odd'\] must be a mapping of options or a function, got 3"),
         (None, None, {"mixing": 0.0}, r"mixing must lie in \(0, 1\], got 0.0"),
+        (None, None, {"caution": -1.0}, "caution must not be negative, got -1.0"),
         (None, None, {"labels": np.zeros(3)}, "labels must have shape"),
         (Demonstrations.from_trajectories([([99], [0]), ([0], [0])]), None, {}, "states"),
     ],

@@ -98,7 +98,7 @@ class Report:
             rows.append(("error of the map", bracket(numbers["error_lower"], numbers["error_upper"])))
         if "pairs_of_classes_solved" in numbers:
             solved = f"{numbers['classes_of_local_models']}, {numbers['pairs_of_classes_solved']}"
-            rows.append(("classes of local models, pairs of them solved", solved))
+            rows.append(("classes of local models, pairs that took a solver", solved))
         self._tell("\ngeneralization", rows)
 
     def _how_it_ended(self, general: Generalization) -> list[tuple[str, str]]:

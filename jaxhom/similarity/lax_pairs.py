@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING
 
+import jax
 import numpy as np
 
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 MAX_ACTIONS = 6  # 720 permutations
-_CHUNK = 2**24  # actions of permutations of pairs at a time
+_CHUNK = 2**24  # permutations of pairs at a time
 _TOLERANCE = 1e-4  # to which errors are told apart for the choice of a permutation
 
 
@@ -62,6 +63,11 @@ class LaxPairs:
 
     def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, *, progress: bool = False) -> LocalSimilarity:
         """Bounds on the least errors of different ordered pairs of classes."""
+        parts = np.array_split(pairs, 1 + len(pairs) * len(self._orders) // _CHUNK)
+        found = [self._least_errors(part, goal, progress) for part in parts]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
+
+    def _least_errors(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, progress: bool) -> LocalSimilarity:
         lower, best = self._bounds_by_actions(pairs, goal), np.full(len(pairs), np.inf)
         chosen_upper, chosen = np.full(len(pairs), np.inf), np.zeros(len(pairs), int)
         iterations, status = np.zeros(len(pairs), np.int32), np.full(len(pairs), Status.SOLVED, np.int32)
@@ -80,7 +86,8 @@ class LaxPairs:
             is_better = found.upper < chosen_upper[asked] - goal.tolerance
             chosen[asked[is_better]], chosen_upper[asked[is_better]] = rank, found.upper[is_better]
         # Final where no other permutation is better by more than the tolerance, as decisions with small errors are.
-        is_final = lower.min(axis=1) >= chosen_upper - _TOLERANCE if goal.decides else np.ones(len(pairs), bool)
+        is_final = lower.min(axis=1) >= chosen_upper - _TOLERANCE
+        is_final |= not goal.decides and goal.tolerance <= _TOLERANCE
         self._chosen.update(zip(map(tuple, pairs[is_final].tolist()), chosen[is_final].tolist(), strict=True))
         dtype = self._programs.dtype
         least = np.minimum(lower.min(axis=1), best).astype(dtype)
@@ -100,7 +107,8 @@ class LaxPairs:
         """Bounds [1] for one pair of classes, and a map [n, m] to the renamed model."""
         self.renamings(pair[None])
         rank = self._chosen[tuple(pair.tolist())]
-        return self._programs.map_of(self._renamed(pair[None], rank)[0], goal)
+        found, f = self._programs.map_of(self._renamed(pair[None], rank)[0], goal)
+        return found.replace(lower=np.maximum(found.lower - _TOLERANCE, 0.0)), f  # another may be better by that
 
     def renamings(self, pairs: Int[np.ndarray, "Q 2"]) -> Int[np.ndarray, "Q A"]:
         """Which action of the target stands for each of the source's."""
@@ -120,8 +128,8 @@ class LaxPairs:
         if not self._anchored:  # a single action then has little to say
             return result
         apart = self._actions.errors(pairs, goal._replace(threshold=goal.threshold if goal.decides else 0.0))
-        for part in np.array_split(np.arange(len(pairs)), 1 + result.size * len(actions) // _CHUNK):
-            result[part] = apart[part][:, actions, self._orders].max(axis=2)
+        for order, bounds in zip(self._orders, result.T, strict=True):
+            bounds[:] = apart[:, actions, order].max(axis=1)
         return result
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
@@ -129,6 +129,12 @@ class SimilarityTable:
         self._known = PairBounds(self.mdp.dtype)
         self._lock = threading.RLock()
         self._maps: dict[tuple[int, int], tuple[np.ndarray, LocalSimilarity]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=threading.RLock())
 
     def __repr__(self) -> str:
         kind = "anchored" if self.anchored else "as printed"

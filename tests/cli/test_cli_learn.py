@@ -32,6 +32,15 @@ def algorithm1(files, **options):
     return oracles.algorithm1(lake_transition(files), TRAJECTORIES, **options)
 
 
+def everybody(files):
+    """All demonstrated states that decide vote alike in every other."""
+    policy = oracles.empirical_policy(STATES, ACTIONS, TRAJECTORIES)[1]
+    visited = np.isin(np.arange(STATES), VISITED)
+    voters = visited & ~oracles.absorbing(lake_transition(files))
+    policy[~visited] = policy[voters].mean(axis=0)
+    return policy, np.where(visited, 0, 1)
+
+
 METHODS = {
     "": algorithm1,
     "--threshold 0.4 --mutual --tolerance 1e-3": lambda files: algorithm1(files, threshold=0.4, mutual=True),
@@ -39,6 +48,7 @@ METHODS = {
     "--method nearest-neighbors --metric euclidean": lambda files: oracles.euclidean_nearest_neighbors(
         files.arrays("model.npz")["coordinates"], ACTIONS, TRAJECTORIES
     ),
+    "--voters all --relation isomorphic --threshold 1": lambda files: everybody(files),
     "--method maximum-entropy": lambda files: (
         oracles.empirical_policy(STATES, ACTIONS, TRAJECTORIES)[1],
         np.where(np.isin(np.arange(STATES), VISITED), 0, -1),
@@ -69,6 +79,18 @@ REACHED = {
         "soft_local_homomorphism",
         {"threshold": 0.2, "tolerance": 0.1, "anchored": True, "mutual": False},
     ),
+    "--relation lax --voters 3 --weights similarity --temperature 0.2": (
+        "soft_local_homomorphism",
+        {
+            "relation": "lax",
+            "voters": 3,
+            "weights": "similarity",
+            "temperature": 0.2,
+            "anchored": True,
+            "mutual": False,
+        },
+    ),
+    "--method choose --distance 2": ("choose_generalization", {"distance": 2}),
     "--method soft-homomorphism": ("soft_homomorphism", {"anchored": True}),
     "--method soft-homomorphism --printed --tolerance 0.2 --max-iterations 64": (
         "soft_homomorphism",
@@ -91,6 +113,36 @@ def test_options_reach_their_method(files, monkeypatch, options):
     for name in ("progress", "states", "table"):
         given.pop(name, None)
     assert given == expected
+
+
+@pytest.mark.parametrize("method", ["soft-local-homomorphism", "soft-homomorphism", "choose"])
+def test_labels_reach_their_method(files, monkeypatch, method):
+    given = {}
+
+    def record(mdp, *_, **settings):
+        given.update(settings)
+        raise KeyboardInterrupt
+
+    for name in ("soft_local_homomorphism", "soft_homomorphism", "choose_generalization"):
+        monkeypatch.setattr(methods, name, record)
+    labels = np.random.default_rng(0).random((STATES, 2))
+    np.save(files.path("labels.npy"), labels)
+    arguments = ["--labels", files.path("labels.npy"), "--label-weight", "0.5"]
+    assert main(["learn", *files.options(), "--method", method, *arguments]) == 130
+    np.testing.assert_array_equal(given["labels"], labels)
+    assert given["label_weight"] == 0.5
+    if "table" in given:
+        np.testing.assert_allclose(given["table"].labels[:, 0], 0.5 * labels)
+    assert main(["learn", *files.options(), "--method", method, "--labels", "reward"]) == 130
+    np.testing.assert_array_equal(given["labels"], files.arrays("model.npz")["reward"])
+
+
+def test_the_choice_reports_its_scores(files, capsys):
+    assert main(["learn", *files.options(), "--method", "choose", "--no-pictures"]) == 0
+    report, printed = files.report()["generalization"], capsys.readouterr().out
+    assert report["chosen"] in report["candidates"] and len(report["scores"]) == len(report["candidates"])
+    assert f"log-likelihood of a step left out, {report['candidates'][0]}" in printed
+    assert str(files.arrays("out/policy.npz")["chosen"]) == report["chosen"]
 
 
 def test_the_global_map_reports_its_bounds(files, monkeypatch, capsys):

@@ -172,7 +172,9 @@ def test_lax_maps_prove_their_errors():
         (source, _), (target, _) = (local(mdp, state) for state in (s, t))
         f = maps.maps[p][: len(source), : len(target)]
         assert oracles.homomorphism_residual(source, target[:, renamings[p]], f) <= maps.upper[p] + 1e-12
-    assert np.all(maps.lower <= table.brackets(*PAIRS).upper)
+    least = by_brute_force(mdp, lambda *ends: oracles.lax_homomorphism_lp(*ends[:2])[0])
+    assert np.all(maps.lower <= least + 1e-9) and np.all(least <= maps.upper + 1e-9)
+    assert_bounds(table.brackets(*PAIRS), least, 1e-4)  # after the maps, too
 
 
 def test_corners_of_a_grid_are_alike_but_for_the_names_of_actions():

@@ -1,12 +1,15 @@
 """The table of similarities: asked in any order, it answers as if it were new, and solves nothing twice."""
 
+import concurrent.futures
+import copy
 import functools
+import pickle
 
 import numpy as np
 import oracles
 import pytest
 
-from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar, programs
+from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar, programs, racetrack
 from jaxhom.similarity import class_pairs
 from jaxhom.similarity.local_models import local_models
 
@@ -149,3 +152,22 @@ def test_it_says_what_it_holds():
     table = SimilarityTable(gridworld(6))
     table.decide([0, 7], [7, 8])
     assert repr(table) == "SimilarityTable(36 states, distance 1, anchored; so far 2 classes, 2 pairs of them)"
+
+
+def test_threads_share_a_table():
+    """Each asks for pairs of its own, and all get what a single thread gets."""
+    mdp = racetrack(["S...F", "S...F"]).mdp
+    rng = np.random.default_rng(0)
+    asked = rng.integers(0, mdp.num_states, (8, 2, 200))
+    table, alone = SimilarityTable(mdp), SimilarityTable(mdp)
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda pairs: table.decide(*pairs, 0.1), asked))
+    np.testing.assert_array_equal(found, [alone.decide(*pairs, 0.1) for pairs in asked])
+
+
+def test_a_table_can_be_copied_and_pickled():
+    table = SimilarityTable(gridworld(4), relation="lax", labels=np.ones((16, 1)))
+    decided = table.decide([0, 1], [3, 2])
+    for copied in (pickle.loads(pickle.dumps(table)), copy.deepcopy(table)):
+        np.testing.assert_array_equal(copied.decide([0, 1], [3, 2]), decided)
+        assert repr(copied) == repr(table)

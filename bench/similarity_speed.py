@@ -7,6 +7,7 @@ is the median of three calls after a first one; `compile_s` is what the first to
 
 import functools
 import itertools
+import time
 from collections.abc import Iterator
 
 import jax
@@ -22,6 +23,7 @@ from bench.linear_programs import Conic, Homomorphisms  # noqa: E402
 from bench.lp_peers import Settings  # noqa: E402
 from bench.processes import NoAnswer, measure, timed  # noqa: E402
 from bench.provenance import provenance  # noqa: E402
+from bench.road_graph import road_graph  # noqa: E402
 from jaxhom.generalization.global_lp import GlobalHomomorphismProblem  # noqa: E402
 from jaxhom.similarity.brackets import Goal, bracket_errors  # noqa: E402
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem  # noqa: E402
@@ -51,6 +53,7 @@ MAX_PDHG_SIZE = 8  # tight brackets of larger random models take it a tenth of a
 OUR_COUNTS = (1, 8, 64, 512, 4096, 32768)
 PEER_COUNTS = (1, 8, 64, 512)
 _LIMIT = 300.0  # seconds for a peer's row
+_ROAD_PAIRS = 60_000
 _PACKAGES = ("jax", "highspy", "moreau", "mpax")
 
 
@@ -259,6 +262,25 @@ def section_racetrack(quick: bool) -> list[dict]:
         return judged(lower, upper) | {"actions": mdp.num_actions, "note": f"{number} classes"}
 
     return cold_and_warm("racetrack, all pairs", "jaxhom auto", mdp.num_states**2, call, describe)
+
+
+def section_roads(quick: bool) -> Iterator[dict]:
+    """Decisions about an irregular graph: pairs of classes at distance 2, at one threshold after the other."""
+    roads = road_graph(6 if quick else 15)
+    start = time.perf_counter()
+    table = jaxhom.SimilarityTable(roads.mdp, distance=2)
+    classes = table.classes()
+    seconds = time.perf_counter() - start
+    _, first = np.unique(classes, return_index=True)  # a state of each class
+    states = f"{roads.mdp.num_states} links, {len(first)} classes"
+    yield row("road network, classes", "jaxhom", len(classes), seconds, actions=roads.mdp.num_actions, note=states)
+    pairs = first[np.random.default_rng(0).integers(0, len(first), (2, _ROAD_PAIRS))]
+    for threshold in (0.0, 0.1, 0.2):
+        before, start = table.num_solved, time.perf_counter()
+        similar = table.decide(*pairs, threshold)
+        seconds = time.perf_counter() - start
+        note = f"threshold {threshold:g}: {similar.mean():.2%} similar, {table.num_solved - before} pairs took a solver"
+        yield row("road network, decisions", "jaxhom", _ROAD_PAIRS, seconds, actions=roads.mdp.num_actions, note=note)
 
 
 def section_algorithm1(quick: bool) -> list[dict]:

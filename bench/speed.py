@@ -47,7 +47,7 @@ KINDS = {
         title="local and global homomorphisms, against other LP solvers",
         sections=(
             *("peak", "brackets", "counts", "decisions", "gradients", "peers"),
-            *("racetrack", "algorithm1", "global", "global_large"),
+            *("racetrack", "roads", "algorithm1", "global", "global_large"),
         ),
         quick=("brackets", "decisions", "gradients", "peers"),
         fields=(

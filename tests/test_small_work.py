@@ -66,6 +66,18 @@ STEPS = {
     ),
     "disjoint_union": lambda mdp, policy: jaxhom.disjoint_union([mdp, mdp]).place(1, DEMONSTRATIONS).states,
     "local_similarity": lambda mdp, policy: jaxhom.local_similarity(mdp, [0, 1], [2, 3]),
+    "local_similarity, labels": lambda mdp, policy: jaxhom.local_similarity(
+        mdp, [0, 1], [2, 3], labels=np.asarray(mdp.features)
+    ),
+    "isomorphic": lambda mdp, policy: jaxhom.soft_local_homomorphism(
+        mdp, DEMONSTRATIONS, relation="isomorphic", voters=2
+    ),
+    "walks, weighted": lambda mdp, policy: jaxhom.soft_local_homomorphism(
+        mdp, DEMONSTRATIONS, relation="random_walk", voters="all", weights="similarity", threshold=0.5
+    ),
+    "choose_generalization": lambda mdp, policy: jaxhom.choose_generalization(
+        mdp, DEMONSTRATIONS, {"plain": {}, "walks": {"relation": "random_walk"}, "k-NN": jaxhom.nearest_neighbors}
+    ),
     "lpal": lambda mdp, policy: jaxhom.lpal(mdp, np.full(FEATURES, 3.0), initial_policy=policy),
     "lpal of two": lambda mdp, policy: jaxhom.lpal(mdp, np.array([3.0, 4.0])[:, None] + np.zeros(FEATURES)),
 }

@@ -127,6 +127,7 @@ def bracket_errors(
     anchored: bool = True,
     pairs: np.ndarray | None = None,
     goal: Goal = Goal(),  # noqa: B008 (a tuple, it never changes)
+    iterates: bool = True,
     progress: Callable[[int], object] | None = None,
 ) -> LocalSimilarity:
     """Brackets the optimal errors of LP (9) for P pairs of models given as arrays.
@@ -141,6 +142,7 @@ def bracket_errors(
       anchored: require that the centre is mapped to the centre.
       pairs: int [P, 2], numbers of a source and a target each; if None, each source with the target of its number.
       goal: what to settle for.
+      iterates: solve what bounds and intervals leave open; otherwise that is at its limit of iterations, which is 0.
       progress: called with the number of pairs that just finished.
 
     Returns:
@@ -166,6 +168,9 @@ def bracket_errors(
     progress(len(result.lower) - len(waiting))
     if goal.decides and goal.method == "auto" and waiting.size:
         waiting = _decide_by_intervals(models, waiting, goal, result, progress)
+    if not iterates:
+        result.status[waiting] = Status.ITERATION_LIMIT
+        return result
     for start in range(0, len(waiting), _CHUNK_PAIRS):
         chunk = waiting[start : start + _CHUNK_PAIRS]
         found = _solve(models.problem(chunk), goal, progress)

@@ -101,12 +101,13 @@ class ClassPairs:
     Args:
       models: those that stand for the classes.
       anchored: require that the centre is mapped to the centre.
+      iterates: as in `bracket_errors`.
     """
 
     has_maps = True
 
-    def __init__(self, models: ClassModels, anchored: bool):
-        self._models, self._anchored = models, anchored
+    def __init__(self, models: ClassModels, anchored: bool, *, iterates: bool = True):
+        self._models, self._anchored, self._iterates = models, anchored, iterates
         self.dtype, self._num_actions = models.dtype, models.num_actions
         self.num_solved = 0
         self.most = 2.0 * models.label_size if models.has_labels else 1.0  # that any map can be off by
@@ -121,7 +122,7 @@ class ClassPairs:
                 for index in self._models.chunks(members, widths):
                     models = self._pair(pairs[index], widths)
                     limited = self._limited(goal, widths, _MAX_PRODUCTS)
-                    found = bracket_errors(**models, goal=limited, progress=bar.update)
+                    found = bracket_errors(**models, goal=limited, iterates=self._iterates, progress=bar.update)
                     jax.tree.map(lambda place, new, index=index: np.put(place, index, new), result, found)
         self.num_solved += int((result.iterations > 0).sum())
         return result

@@ -141,7 +141,7 @@ class _Actions:
     """
 
     def __init__(self, models: ClassModels):
-        self._models, self._programs = models, ClassPairs(_SingleActions(models), True)
+        self._models, self._programs = models, ClassPairs(_SingleActions(models), True, iterates=False)
         self._known, self._number_of_key = PairBounds(models.dtype), {}
         self._alike = np.zeros((0, models.num_actions), int)  # of each class and action: one that is the same
 

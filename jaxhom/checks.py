@@ -212,10 +212,18 @@ def require_discount(discount: Any, dtype: DTypeLike = np.float64) -> Float[np.n
     return rounded
 
 
+def require_number(name: str, value: Any) -> float:
+    """Returns `value`, one real number or a scalar array of one, as a float; NaN is none."""
+    host = as_host_array(name, value)
+    if host.shape != () or host.dtype.kind not in "fiu" or np.isnan(host):
+        raise ValueError(f"{name} must be a number, got {in_one_line(value)}")
+    return float(host)
+
+
 def require_count(name: str, value: Any, least: int = 1) -> int:
     """Returns `value` as an int of at least `least`."""
     try:
-        value = operator.index(value)
+        value = operator.index(None if isinstance(value, bool) else value)
     except TypeError:
         raise ValueError(f"{name} must be a whole number, got {in_one_line(value)}") from None
     if value < least:

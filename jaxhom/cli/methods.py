@@ -48,11 +48,10 @@ def _local(problem, demonstrations, progress, states, *, printed=False, mutual=F
     return found, {"classes_of_local_models": table.num_classes, "pairs_of_classes_solved": table.num_solved}
 
 
-def _choose(problem, demonstrations, progress, states, **settings) -> Found:
+def _choose(problem, demonstrations, progress, _, **settings) -> Found:
     if "labels" in settings:
         settings["labels"] = problem.labels(settings["labels"])
-    if problem.terminal is not None:
-        states = ~problem.terminal
+    states = None if problem.terminal is None else ~problem.terminal  # all, whichever are asked about
     choice = choose_generalization(problem.mdp, demonstrations, states=states, progress=progress, **settings)
     names, scores = list(choice.scores), list(choice.scores.values())
     return choice.best, {"chosen": choice.name, "candidates": names, "scores": scores}
@@ -194,6 +193,8 @@ def check_method(problem: Problem, options: argparse.Namespace) -> None:
     for name, owner in (("label_weight", "labels"), ("temperature", "weights")):
         if name in settings and owner not in settings:
             raise ValueError(f"{_flag(name)} belongs to {_flag(owner)}")
+    if settings.get("label_weight", 0.0) < 0.0:
+        raise ValueError(f"--label-weight must not be negative, got {settings['label_weight']}")
     if settings.get("relation") == "lax" and problem.mdp.num_actions > MAX_ACTIONS:
         count = problem.mdp.num_actions
         raise ValueError(f"--relation lax is for up to {MAX_ACTIONS} actions, and {problem.name} has {count}")

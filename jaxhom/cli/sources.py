@@ -109,8 +109,10 @@ class Problem:
             return np.asarray(self.reward)
         try:
             array = np.load(source, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise FileError(f"--labels {source}: not features or reward, and no .npy file: {error}") from None
+        except OSError as error:
+            raise FileError(f"--labels {source}: not features or reward, and no .npy file: {error.strerror}") from None
+        except (ValueError, EOFError):
+            raise FileError(f"--labels {source}: not features or reward, and no .npy file of numbers") from None
         if not isinstance(array, np.ndarray):
             raise FileError(f"--labels {source}: must be an .npy file of a single array")
         return array

@@ -21,14 +21,14 @@ from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.generalization.votes import policies_that_count
 from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.demonstrations import Demonstrations
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, asked_states
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.given_table import table_for
 from jaxhom.similarity.relations import UserRelation
 from jaxhom.similarity.table import SimilarityTable
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, ArrayLike, Bool, Num
+    from jaxtyping import ArrayLike, Bool, Num
 
 
 @checks.eager_where_concrete
@@ -130,11 +130,11 @@ def soft_local_homomorphism(
     table = table_for(table, mdp, relation=relation, **kind)
     start = uniform_elsewhere(mdp, demonstrations)
     if is_traced:
-        asking = ~start.visited & _asked(mdp, states)
+        asking = ~start.visited & asked_states(mdp, states)
         experts = votes_in_program.padded_experts(mdp, demonstrations, start.visited)
         found = votes_in_program.vote_by_rule(mdp, start, experts, asking, table, rule)
         return extend(mdp, start, found.votes, None, undecided=found.undecided, status=found.status)
-    asking = ~np.asarray(start.visited) & _asked(mdp, states)
+    asking = ~np.asarray(start.visited) & asked_states(mdp, states)
     votes, ended = _vote_on_host(mdp, start, asking, table, rule, progress)
     return extend(mdp, start, votes, ByHomomorphism(mdp, table, asking, rule), **ended)
 
@@ -153,12 +153,3 @@ def _vote_on_host(mdp: MDP, start: Generalization, asking: np.ndarray, table: Si
         "status": checks.to_device(np.asarray(ballots.status), jnp.int32),
     }
     return votes, ended
-
-
-def _asked(mdp: MDP, states) -> np.ndarray | Array:
-    """bool [S]: the states that a policy is wanted for."""
-    if states is None:
-        return np.ones(mdp.num_states, bool)
-    states = states if checks.is_traced(states) else checks.as_host_array("states", states)
-    checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == (mdp.num_states,))
-    return states.astype(bool)

@@ -24,7 +24,7 @@ from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.generalization.votes import vote_of_rings
 from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.demonstrations import Demonstrations
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, asked_states, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states, uniform_policy
 from jaxhom.similarity.given_table import table_for
 from jaxhom.similarity.lax_pairs import MAX_ACTIONS
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 Candidate = Mapping[str, Any] | Callable[[MDP, Demonstrations], Generalization]
 
 _THRESHOLDS = (0.0, 0.1, 0.2)
+_PLAIN = str | int | float
 _LITTLE = 0.05
 _ROUNDING = 1e-12
 _MIXINGS = np.geomspace(0.01, 1.0, 33)
@@ -126,26 +127,25 @@ def choose_generalization(
     if checks.is_traced(mdp, demonstrations):
         raise ValueError("candidates are compared on the host: call choose_generalization outside jit, vmap and grad")
     checks.refuse_traced(mixing=mixing, caution=caution)
-    if not caution >= 0:
-        raise ValueError(f"caution must not be negative, got {caution}")
-    if mixing is not None and not 0 < mixing <= 1:
+    if mixing is not None and not 0 < checks.require_number("mixing", mixing) <= 1:
         raise ValueError(f"mixing must lie in (0, 1], got {mixing}")
+    if not checks.require_number("caution", caution) >= 0:
+        raise ValueError(f"caution must not be negative, got {caution}")
     shared = {"distance": distance, "labels": labels, "label_weight": label_weight, "states": states}
     if candidates is None:
         candidates = default_candidates(mdp, labels is not None)
     if not isinstance(candidates, Mapping) or not candidates:
         raise ValueError("candidates must be a mapping that is not empty, from names to options or functions")
-    left_out, tables = _LeftOut(mdp, demonstrations, states), _Tables(mdp)
-    known = {name: _checked(name, candidate, shared) for name, candidate in candidates.items()}
+    left_out, tables = _LeftOut(mdp, demonstrations, asked_states(mdp, states)), _Tables(mdp)
+    known = {name: _checked(name, candidate, shared, tables) for name, candidate in candidates.items()}
     scores = {}
     for name, candidate in tqdm(known.items(), desc="candidates", leave=False, disable=not progress):
-        scores[name] = left_out.score(left_out.policies(candidate, tables, progress), mixing)
+        scores[name] = left_out.score(left_out.policies(name, candidate, progress), mixing)
     highest = max(scores.values(), key=lambda score: score.mean)
     name = next(name for name, score in scores.items() if highest.ahead_of(score) <= caution)
     best = known[name]
     if isinstance(best, dict):
-        options = {**best, "table": tables.of(best), "progress": progress}
-        best = functools.partial(soft_local_homomorphism, **options)
+        best = functools.partial(soft_local_homomorphism, **best, progress=progress)
     return Choice(
         best=best(mdp, demonstrations),
         name=name,
@@ -169,21 +169,23 @@ def default_candidates(mdp: MDP, has_labels: bool = False) -> dict[str, Candidat
     return chosen | {"k-NN": nearest_neighbors, "uniform": uniform_elsewhere}
 
 
-def _checked(name: str, candidate: Any, shared: dict[str, Any]) -> dict[str, Any] | Callable:
-    """A function, or all options of a candidate; or `ValueError` that names it."""
+def _checked(name: str, candidate: Any, shared: dict[str, Any], tables: _Tables) -> dict[str, Any] | Callable:
+    """A function, or all options of a candidate, its table among them; or `ValueError` that names it."""
     if callable(candidate):
         return candidate
     if not isinstance(candidate, Mapping):
         raise ValueError(f"candidates[{name!r}] must be a mapping of options or a function, got {candidate!r}")
+    allowed = (*_OF_TABLE, *_OF_RULE, "states", "table")
     for option in candidate:
-        if option not in {*_OF_TABLE, *_OF_RULE, "states", "table"}:
-            raise ValueError(f"candidates[{name!r}] has the option {option!r}, which soft_local_homomorphism lacks")
+        if option not in allowed:
+            raise ValueError(f"candidates[{name!r}] has the option {option!r}, which is none of {', '.join(allowed)}")
     options = {**shared, **candidate}
     try:
         _rule(options)
+        options["states"] = asked_states(tables.mdp, options["states"])
+        return tables.completed(options, candidate)
     except ValueError as error:
         raise ValueError(f"candidates[{name!r}]: {error}") from None
-    return options
 
 
 def _rule(options: dict[str, Any]) -> VotingRule:
@@ -194,17 +196,25 @@ class _Tables:
     """Tables of similarities by their options, one for all candidates that share them."""
 
     def __init__(self, mdp: MDP):
-        self._mdp, self._known = mdp, {}
+        self.mdp = mdp
+        self._known: dict[tuple, SimilarityTable] = {}
 
-    def of(self, options: dict[str, Any]) -> SimilarityTable:
-        """The table of a candidate."""
+    def completed(self, options: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+        """The options of a candidate with its table; one that was given says what is not `given` beside it."""
+        table = options.get("table")
+        if table is not None:
+            of_table = {"distance": table.distance, "anchored": table.anchored, "relation": table.given_relation}
+            if "labels" not in given:
+                of_table |= {"labels": table.labels, "label_weight": 1.0}
+            options = {**options, **{name: value for name, value in of_table.items() if name not in given}}
         kind = {name: options[name] for name in _OF_TABLE if name in options}
-        if options.get("table") is not None:
-            return table_for(options["table"], self._mdp, **{"distance": 1, "anchored": True, **kind})
-        key = tuple((name, id(value) if name in ("labels", "relation") else value) for name, value in kind.items())
+        if table is not None:
+            return options | {"table": table_for(table, self.mdp, **kind)}
+        # Arrays and functions are the same if they are one.
+        key = tuple((name, value if isinstance(value, _PLAIN) else id(value)) for name, value in kind.items())
         if key not in self._known:
-            self._known[key] = SimilarityTable(self._mdp, **kind)
-        return self._known[key]
+            self._known[key] = SimilarityTable(self.mdp, **kind)
+        return options | {"table": self._known[key]}
 
 
 class _Score(NamedTuple):
@@ -238,7 +248,7 @@ class _LeftOut:
     trajectories less those of its own.
     """
 
-    def __init__(self, mdp: MDP, demonstrations: Demonstrations, states):
+    def __init__(self, mdp: MDP, demonstrations: Demonstrations, asked: np.ndarray):
         self._mdp, self._demonstrations = mdp, demonstrations
         uniform_elsewhere(mdp, demonstrations)  # which checks them
         shape, mask = (mdp.num_states, mdp.num_actions), np.asarray(demonstrations.mask)
@@ -250,7 +260,6 @@ class _LeftOut:
         self._trajectory, self._state = np.divmod(self._key, shape[0])
         self._total = np.zeros(shape)
         np.add.at(self._total, self._state, self._counts)
-        asked = np.ones(shape[0], bool) if states is None else np.asarray(states, bool)
         self._matters = (asked & ~np.asarray(absorbing_states(mdp)))[self._state]
         if len(np.unique(self._trajectory[self._matters])) < 2:
             raise ValueError(
@@ -261,20 +270,20 @@ class _LeftOut:
         is_only = np.bincount(self._state, minlength=shape[0]) == 1
         self._owner[self._state] = np.where(is_only[self._state], self._trajectory, -1)
 
-    def policies(self, candidate: dict[str, Any] | Callable, tables: _Tables, progress: bool) -> np.ndarray:
+    def policies(self, name: str, candidate: dict[str, Any] | Callable, progress: bool) -> np.ndarray:
         """[V, A]: what a candidate makes, in the state of each visit, of the other trajectories."""
         if callable(candidate) and candidate not in (nearest_neighbors, uniform_elsewhere):
-            return self._one_by_one(candidate)
+            return self._one_by_one(f"candidates[{name!r}]", candidate)
         policies = self._without(self._trajectory, self._state)
         is_alone = ~policies.any(axis=1)
         elected = uniform_policy(self._mdp).copy()
         if candidate is nearest_neighbors:
             elected = vote_of_rings(self._mdp, *self._ends(elected), self._allowed_votes).policy
         elif isinstance(candidate, dict):
-            table = tables.of(candidate)
+            table = candidate["table"]
             table.classes(np.flatnonzero(self._total.any(axis=1)))
             ballots = HostBallots(self._mdp, table, _rule(candidate), self._votes, progress)
-            elected = ballots.elect(*self._ends(elected, candidate.get("states")), None).policy
+            elected = ballots.elect(*self._ends(elected, candidate["states"]), None).policy
         policies[is_alone] = elected[self._state[is_alone]]
         return policies
 
@@ -296,7 +305,7 @@ class _LeftOut:
     def _ends(self, uniform: np.ndarray, states=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The visited states, the policy where nothing is found, and the states that ask: those of one trajectory."""
         asking = self._owner >= 0
-        return self._total.any(axis=1), uniform, asking if states is None else asking & np.asarray(states, bool)
+        return self._total.any(axis=1), uniform, asking if states is None else asking & states
 
     def _votes(self, states: np.ndarray, experts: np.ndarray) -> np.ndarray:
         """Policies of visited states for states that single trajectories visit, without these."""
@@ -314,12 +323,13 @@ class _LeftOut:
         counts = self._total[state] - own
         return counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
 
-    def _one_by_one(self, function: Callable) -> np.ndarray:
+    def _one_by_one(self, name: str, function: Callable) -> np.ndarray:
         """What a function makes of the demonstrations without each trajectory in turn."""
         policies = np.zeros_like(self._counts)
         everyone = np.arange(len(self._demonstrations))
         for number in np.unique(self._trajectory[self._matters]):
             own = self._trajectory == number
             found = function(self._mdp, self._demonstrations[everyone != number])
-            policies[own] = np.asarray(found.policy)[self._state[own]]
+            policy = check_policy(self._mdp, found, f"the policy of {name}", batch=False)
+            policies[own] = np.asarray(policy)[self._state[own]]
         return policies

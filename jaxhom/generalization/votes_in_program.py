@@ -116,8 +116,10 @@ class _Ballots(NamedTuple):
         """[S, A]: the sum of the votes of voters [S, E]."""
         label, weights = jnp.asarray(self.relation.label), is_voter.astype(self.policy.dtype)
         if self.relation.error is not None:
-            weight = jnp.asarray(self.rule.weight(self.relation.error), self.policy.dtype)
-            weights *= weight[:, label.at[self.experts].get(mode="clip")][label]
+            by_class = jnp.asarray(self.relation.error, self.policy.dtype)
+            error = by_class[:, label.at[self.experts].get(mode="clip")][label]
+            least = jnp.where(is_voter, error, jnp.inf).min(axis=1, keepdims=True)
+            weights *= self.rule.weight(error, jnp.where(jnp.isfinite(least), least, 0.0), jnp)
         if self.relation.renaming is None:
             return sum_of_policies(weights, self.policy, self.experts)
 

@@ -16,6 +16,7 @@ from jaxhom import checks
 from jaxhom.generalization import evidence
 from jaxhom.generalization.votes import Ballots, Votes, vote_of_all, vote_of_rings
 from jaxhom.models.mdp import MDP
+from jaxhom.similarity.brackets import Goal
 from jaxhom.similarity.table import SimilarityTable
 from jaxhom.status import Status
 
@@ -33,7 +34,7 @@ class VotingRule:
       threshold: largest error at which two states count as similar. mutual: in both directions.
       tolerance: of decisions, and of the errors that weights are made of.
       voters: "nearest", "all", or how many of the nearest at least.
-      weights: "equal", or "similarity": exp(-e / temperature).
+      weights: "equal", or "similarity": exp(-e / temperature), times what is the same for all voters of a state.
       temperature: see `weights`.
     """
 
@@ -46,10 +47,13 @@ class VotingRule:
 
     def __post_init__(self) -> None:
         checks.refuse_traced(**dataclasses.asdict(self))
-        if self.voters not in ("nearest", "all"):
-            if isinstance(self.voters, str):
-                raise ValueError(f'voters must be "nearest", "all" or a number, got {self.voters!r}')
-            checks.require_count("voters", self.voters)
+        for name in ("threshold", "tolerance", "temperature"):
+            object.__setattr__(self, name, checks.require_number(name, getattr(self, name)))
+        Goal.checked(threshold=self.threshold, tolerance=self.tolerance)
+        if isinstance(self.voters, str) and self.voters not in ("nearest", "all"):
+            raise ValueError(f'voters must be "nearest", "all" or a number, got {self.voters!r}')
+        if not isinstance(self.voters, str):
+            object.__setattr__(self, "voters", checks.require_count("voters", self.voters))
         if self.weights not in WEIGHTS:
             raise ValueError(f"weights must be one of {WEIGHTS}, got {self.weights!r}")
         if not 0 < self.temperature < np.inf:
@@ -70,9 +74,10 @@ class VotingRule:
         """How many voters to look for in the rings around a state; None for all, wherever they are."""
         return {"nearest": 1, "all": None}.get(self.voters, self.voters)
 
-    def weight(self, error: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """What votes of similar states count."""
-        return np.exp(-np.asarray(error, float) / self.temperature)
+    def weight(self, error, least, xp=np):
+        """What a vote of some error counts beside one of the `least` error: neither nothing nor infinitely much."""
+        most = 0.9 * float(np.log(np.finfo(error.dtype).max))
+        return xp.exp(xp.clip((least - error) / self.temperature, -most, most))
 
 
 class HostBallots:
@@ -94,6 +99,7 @@ class HostBallots:
         self._mdp, self._table, self._rule, self._policy_of = mdp, table, rule, policy_of
         self._progress = progress
         self.undecided, self.status = np.zeros(mdp.num_states, np.int32), Status.SOLVED
+        self._least = np.full(mdp.num_states, np.inf)  # error of the first voters of each state
 
     def elect(self, visited, policy, asking, group: Int[np.ndarray, " S"] | None) -> Votes:
         """The votes in the states that ask, bool [S]; `group` as in `vote_of_all`."""
@@ -121,6 +127,12 @@ class HostBallots:
         if table.renames:
             votes = np.take_along_axis(votes, table.renamings(states, experts), axis=1)
         if rule.is_weighted:
-            votes = votes * rule.weight(found.error[found.similar])[:, None]
+            votes = votes * self._weights(states, found.error[found.similar].astype(float))[:, None]
         result[chosen] = evidence.allowed_part(self._mdp, states, votes)
         return result
+
+    def _weights(self, states, error) -> Float[np.ndarray, " P"]:
+        """Of votes in states [P]: relative to the least error of those that voted there first."""
+        is_first = np.isinf(self._least[states])
+        np.minimum.at(self._least, states[is_first], error[is_first])
+        return self._rule.weight(error, self._least[states])

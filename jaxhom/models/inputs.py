@@ -15,7 +15,7 @@ from jaxhom import checks
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, ArrayLike, Float, Int, Num
+    from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 
 def as_model(mdp: Any) -> MDP:
@@ -191,3 +191,18 @@ def check_labels(
         labels = checks.require_floats_in(mdp.dtype, f"label_weight * {name}", weighted)
     xp = np if isinstance(labels, np.ndarray) else jnp
     return labels if by_pair else xp.broadcast_to(labels[:, None], (states, actions, labels.shape[-1]))
+
+
+def asked_states(mdp: MDP, states: Bool[ArrayLike, " S"] | None) -> Bool[Array | np.ndarray, " S"]:
+    """The states that something is wanted for, all if None; in NumPy where they are concrete.
+
+    Raises:
+      ValueError: if they are not bool [S]. Numbers of states are no mask.
+    """
+    if states is None:
+        return np.ones(mdp.num_states, bool)
+    states = states if checks.is_traced(states) else checks.as_host_array("states", states)
+    checks.require_shape("states", states, f"({mdp.num_states},)", states.shape == (mdp.num_states,))
+    if states.dtype != bool:
+        raise ValueError(f"states must be a mask of booleans, got dtype {states.dtype}")
+    return states

@@ -9,6 +9,7 @@ isomorphism, which costs time, but never invent one.
 import numpy as np
 
 _MAX_ONE_BY_ONE = 32  # larger models have their ties broken all at once
+_MAX_ATTEMPTS = 2000  # to name the image of a state, before it stays open whether two models are equal
 _SEED = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -43,6 +44,60 @@ def canonical_forms(
         ordered = np.take_along_axis(marks, order[:, :, None], axis=1)
         keys = [key + mark.tobytes() for key, mark in zip(keys, ordered, strict=True)]
     return keys, order
+
+
+def stable_colours(transition: np.ndarray, bits: int, labels: np.ndarray | None = None) -> np.ndarray:
+    """Colours [P, n] of the states after refinement; the same, in some order, for isomorphic models."""
+    quanta, marks = _quantised(transition, labels, bits)
+    return _refine(quanta, _first_colours(quanta, marks))
+
+
+def are_isomorphic(transition: np.ndarray, bits: int, labels: np.ndarray | None = None) -> bool | None:
+    """Whether two models are equal up to a renaming of states that keeps the centre; None if that takes too long.
+
+    A state whose colour others share is singled out in the first model, and each that may be its image in the second
+    one, until all colours are different; colours that do not occur as often in both end the attempt.
+
+    Args:
+      transition, bits, labels: of the two, as in `canonical_forms`.
+    """
+    quanta, marks = _quantised(transition, labels, bits)
+    left, waiting = _MAX_ATTEMPTS, [_refine_together(quanta, _first_colours(quanta, marks))]
+    while waiting:
+        colour = waiting.pop()
+        if colour is None:
+            continue
+        tied = _tied(colour[:1])[0]
+        if not tied.any():
+            order = np.argsort(colour, axis=1)
+            rows = np.take_along_axis(quanta, order[:, :, None, None], axis=1)
+            one, other = np.take_along_axis(rows, order[:, None, None, :], axis=3)
+            same_marks = marks is None or np.array_equal(*np.take_along_axis(marks, order[:, :, None], axis=1))
+            if same_marks and np.array_equal(one, other):
+                return True
+            continue
+        chosen = colour[0, tied].min()
+        first = int(np.flatnonzero(colour[0] == chosen)[0])
+        for image in np.flatnonzero(colour[1] == chosen):
+            if left == 0:
+                return None
+            left -= 1
+            single = colour.copy()
+            single[[0, 1], [first, image]] = _mix(chosen + np.uint64(7))
+            waiting.append(_refine_together(quanta, single))
+    return False
+
+
+def _refine_together(quanta: np.ndarray, colour: np.ndarray) -> np.ndarray | None:
+    """Refined colours [2, n] of two models, after equally many rounds; None where these differ in how often."""
+    present, edge = _edges(quanta)
+    while True:
+        if not np.array_equal(*np.sort(colour, axis=1)):
+            return None
+        refined = _refined(edge, present, colour)
+        if (_num_colours(refined) == _num_colours(colour)).all():
+            return colour
+        colour = refined
 
 
 def colours_in_rounds(

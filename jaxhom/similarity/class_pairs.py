@@ -74,11 +74,15 @@ class ClassModels:
         models = self._maker.make(self._book.representative[different], width)
         return jax.tree.map(lambda leaf: leaf[position], models)
 
-    def alone(self, number: int, most: float | None = None) -> LocalModel:
-        """The model of one class, not padded; with labels of at most so much, if `most` is given."""
+    def alone(self, number: int, *, is_scaled: bool = False) -> LocalModel:
+        """The model of one class, not padded; with labels of at most about 1, if they are to be scaled."""
         found = self.of(np.array([number]), int(self.size[number]))
-        labels = None if found.labels is None else found.labels[0] * (most / self.label_size if most else 1.0)
-        return LocalModel(states=found.members[0], transition=found.transition[0], labels=labels)
+        labels = self._maker.scaled(found.labels) if is_scaled else found.labels
+        return LocalModel(
+            states=found.members[0],
+            transition=found.transition[0],
+            labels=None if labels is None else labels[0],
+        )
 
     def of_pairs(self, pairs: np.ndarray) -> Iterator[tuple[np.ndarray, LocalModels, LocalModels]]:
         """Numbers of different pairs of classes [Q, 2] of a few sizes, and their models; none that are too large."""
@@ -142,11 +146,12 @@ class ClassPairs:
     def slack(self, pairs: np.ndarray) -> np.ndarray:
         """[Q]: how far the errors of other members of two classes can lie from those that were solved for.
 
-        Nothing where the classes are the same, or where a model is too large to have company in its class.
+        Within a class that is a quantum; nothing where a model is too large to have company in its class.
         """
         sizes = self._models.size[pairs]
-        alone = (pairs[:, 0] == pairs[:, 1]) | is_oversized(sizes, self._num_actions).any(axis=1)
-        return np.where(alone, 0.0, self._slack_of(sizes.max(axis=1, initial=0))).astype(self.dtype)
+        slack = self._slack_of(sizes.max(axis=1, initial=0))
+        slack = np.where(pairs[:, 0] == pairs[:, 1], model_rounding(self.dtype) * self._models.label_size, slack)
+        return np.where(is_oversized(sizes, self._num_actions).any(axis=1), 0.0, slack).astype(self.dtype)
 
     def _slack_of(self, size):
         """The slack of models of up to so many states: a row of T f or f T' sums as many, labels are two at a time."""
@@ -171,9 +176,7 @@ class ClassPairs:
         group, count = groups.of_pair[:, 0], len(groups.of_pair)
         return LocalSimilarity(
             lower=np.zeros(count, self.dtype),
-            upper=np.where(group == _SAME, model_rounding(self.dtype) * self._models.label_size, self.most).astype(
-                self.dtype
-            ),
+            upper=np.where(group == _SAME, 0.0, self.most).astype(self.dtype),
             iterations=np.zeros(count, np.int32),
             status=np.where(group == _TOO_LARGE, Status.ITERATION_LIMIT, Status.SOLVED).astype(np.int32),
         )

@@ -84,7 +84,7 @@ class ClassBook:
                 keys = [b"state %d" % state for state in states[index]]
             else:
                 models = self._maker.make(states[index], size, members[index])
-                labels = None if models.labels is None else models.labels / self._maker.label_size
+                labels = self._maker.scaled(models.labels)
                 forms, _ = canonical_forms(models.transition, quantum_bits(graph.dtype), labels)
                 keys = [hashlib.blake2b(form, digest_size=16).digest() for form in forms]
             for state, key in zip(states[index].tolist(), keys, strict=True):

@@ -76,6 +76,8 @@ def walks_in_common(
     Source: Vishwanathan, Borgwardt and Schraudolph 2007; the labels of walks are those of Kashima, Tsuda and Inokuchi
     2003.
     """
+    source, target = np.asarray(source, float), np.asarray(target, float)
+    labels = tuple(np.asarray(side, float) for side in labels)
     count, n, num_actions, _ = source.shape
     m = target.shape[1]
     real = (np.arange(n) < source_size[:, None])[:, :, None] & (np.arange(m) < target_size[:, None])[:, None]
@@ -84,8 +86,7 @@ def walks_in_common(
         alike *= (np.arange(n) == 0)[:, None] == (np.arange(m) == 0)
     stays, stays_there = (np.einsum("qiai->qai", model) for model in (source, target))
     moves, moves_there = (
-        np.moveaxis(model * ~np.eye(model.shape[1], dtype=bool)[:, None], 2, 0)
-        for model in (np.asarray(source, float), np.asarray(target, float))
+        np.moveaxis(model * ~np.eye(model.shape[1], dtype=bool)[:, None], 2, 0) for model in (source, target)
     )
     back = np.swapaxes(moves_there, 2, 3)
     share = CONTINUATION / num_actions * _label_kernel(labels, (num_actions, count, n, m))

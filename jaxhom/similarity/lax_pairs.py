@@ -83,12 +83,13 @@ class LaxPairs:
             best[asked] = np.minimum(best[asked], found.upper)
             iterations[asked] += found.iterations
             status[asked] = np.maximum(status[asked], found.status)
-            is_better = found.upper < chosen_upper[asked] - goal.tolerance
+            is_better = found.upper < chosen_upper[asked] - max(goal.tolerance, _TOLERANCE)
             chosen[asked[is_better]], chosen_upper[asked[is_better]] = rank, found.upper[is_better]
         # Final where no other permutation is better by more than the tolerance, as decisions with small errors are.
         is_final = lower.min(axis=1) >= chosen_upper - _TOLERANCE
         is_final |= not goal.decides and goal.tolerance <= _TOLERANCE
-        self._chosen.update(zip(map(tuple, pairs[is_final].tolist()), chosen[is_final].tolist(), strict=True))
+        for pair, rank in zip(pairs[is_final].tolist(), chosen[is_final].tolist(), strict=True):
+            self._chosen.setdefault(tuple(pair), rank)
         dtype = self._programs.dtype
         least = np.minimum(lower.min(axis=1), best).astype(dtype)
         upper = np.where(np.isfinite(best), best, self._programs.most).astype(dtype)
@@ -108,7 +109,8 @@ class LaxPairs:
         self.renamings(pair[None])
         rank = self._chosen[tuple(pair.tolist())]
         found, f = self._programs.map_of(self._renamed(pair[None], rank)[0], goal)
-        return found.replace(lower=np.maximum(found.lower - _TOLERANCE, 0.0)), f  # another may be better by that
+        least = self.brackets(pair[None], goal._replace(method="auto"))
+        return found.replace(lower=np.minimum(found.lower, least.lower)), f  # another may be better by the tolerance
 
     def renamings(self, pairs: Int[np.ndarray, "Q 2"]) -> Int[np.ndarray, "Q A"]:
         """Which action of the target stands for each of the source's."""
@@ -162,7 +164,7 @@ class _Actions:
         for number in range(len(self._alike), len(self._models.size)):
             row = np.arange(self._models.num_actions) + number * self._models.num_actions
             if not is_oversized(self._models.size[number], self._models.num_actions):
-                model = self._models.alone(number, most=1.0)
+                model = self._models.alone(number, is_scaled=True)
                 labels = None if model.labels is None else np.moveaxis(model.labels, 1, 0)[:, :, None]
                 singles = np.moveaxis(model.transition, 1, 0)[:, :, None]
                 keys, _ = canonical_forms(singles, quantum_bits(self._models.dtype), labels)

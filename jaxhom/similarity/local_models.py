@@ -128,7 +128,11 @@ class LocalModelMaker:
         parts = [part.astype(graph.dtype) for part in (labels, refused) if part is not None and part.size]
         self.labels = np.concatenate(parts, axis=2) if parts else None
         largest = 0.0 if self.labels is None else float(np.abs(self.labels).max(initial=0.0))
-        self.label_size = 2.0 ** np.ceil(np.log2(max(largest, 1.0)))
+        self.label_size = 2.0 ** min(np.ceil(np.log2(max(largest, 1.0))), 1023.0)
+
+    def scaled(self, labels: np.ndarray | None) -> np.ndarray | None:
+        """Labels of at most about 1, in float64."""
+        return None if labels is None else labels.astype(np.float64) / self.label_size
 
     def members(self, states: np.ndarray) -> scipy.sparse.csr_array:
         """Boolean [P, S], sorted: the states of each model."""

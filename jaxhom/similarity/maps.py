@@ -79,8 +79,7 @@ class _Renamings:
         if state == centre or is_oversized(size, self._maker.graph.num_actions):  # alone in its class
             return np.arange(size)
         models = self._maker.make(np.array([state, centre]), size)
-        labels = None if models.labels is None else models.labels / self._maker.label_size
-        return isomorphism(*models.transition, labels)
+        return isomorphism(*models.transition, self._maker.scaled(models.labels))
 
 
 def _padded_members(maker: LocalModelMaker, states: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from jaxhom import checks
 from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom.similarity.canonical_forms import are_isomorphic, stable_colours
 from jaxhom.similarity.class_pairs import ClassModels, ClassPairs, LocalModel
 from jaxhom.similarity.classes import quantum_bits
 from jaxhom.similarity.graph_kernels import colour_counts, cosines, walks_in_common
@@ -119,17 +120,46 @@ class _WithoutPrograms:
 
 
 class _Isomorphic(_WithoutPrograms):
-    """0 for a class against itself, 1 for any other: local models that are equal up to a renaming of states."""
+    """0 for models that are equal up to a renaming of states, 1 for others."""
 
-    def _bounds(self, pairs, progress):
-        progress(len(pairs))
-        return np.repeat(pairs[:, :1] != pairs[:, 1:], 2, axis=1)
+    def __init__(self, models: ClassModels, anchored: bool):
+        super().__init__(models, anchored)
+        self._colours: dict[int, bytes] = {}
 
     def brackets(self, pairs, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
-        """Models that are too large to be looked at are alone in their classes."""
+        """Models that are too large to be looked at are not told apart, but from themselves."""
         found = super().brackets(pairs, goal, progress=progress)
-        error = (pairs[:, 0] != pairs[:, 1]).astype(self._dtype)
-        return found.replace(lower=error, upper=error.copy(), status=np.full(len(pairs), Status.SOLVED, np.int32))
+        same = pairs[:, 0] == pairs[:, 1]
+        upper, status = np.where(same, 0.0, found.upper), np.where(same, Status.SOLVED, found.status)
+        is_open = found.lower < upper
+        status = np.where(is_open, Status.ITERATION_LIMIT, status).astype(np.int32)
+        return found.replace(upper=upper.astype(self._dtype), status=status)
+
+    def _bounds(self, pairs, progress):
+        # Models of one class are equal up to a renaming; the reverse is nearly always true, and not always.
+        bounds = np.repeat(pairs[:, :1] != pairs[:, 1:], 2, axis=1).astype(float)
+        for index in np.flatnonzero(pairs[:, 0] != pairs[:, 1]):
+            one, other = pairs[index].tolist()
+            if self._colours_of(one) == self._colours_of(other):
+                bounds[index] = self._search(one, other)
+        progress(len(pairs))
+        return bounds
+
+    def _colours_of(self, number: int) -> bytes:
+        """The stable colours of a class, which differ where models are not isomorphic, but for rare exceptions."""
+        if number not in self._colours:
+            model = self._models.alone(number, is_scaled=True)
+            labels = None if model.labels is None else model.labels[None]
+            colours = stable_colours(model.transition[None], quantum_bits(self._dtype), labels)
+            self._colours[number] = np.sort(colours[0]).tobytes()
+        return self._colours[number]
+
+    def _search(self, *numbers: int) -> tuple[float, float]:
+        one, other = (self._models.alone(number, is_scaled=True) for number in numbers)
+        labels = None if one.labels is None else np.stack([one.labels, other.labels])
+        bits = quantum_bits(self._dtype)
+        found = are_isomorphic(np.stack([one.transition, other.transition]), bits, labels)
+        return (0.0, 1.0) if found is None else (1.0 - found, 1.0 - found)
 
 
 class _WeisfeilerLehman(_WithoutPrograms):
@@ -140,7 +170,7 @@ class _WeisfeilerLehman(_WithoutPrograms):
     def _bounds(self, pairs, progress):
         models = self._models
         if self._features is None or self._features.shape[0] < len(models.size):
-            known = [models.alone(number, most=1.0) for number in range(len(models.size))]
+            known = [models.alone(number, is_scaled=True) for number in range(len(models.size))]
             self._features = colour_counts(known, quantum_bits(self._dtype), anchored=self._anchored)
         progress(len(pairs))
         return _one_minus(cosines(self._features, pairs))
@@ -186,18 +216,21 @@ class _ByFunction(_WithoutPrograms):
 
     def _ask(self, source: LocalModel, target: LocalModel) -> tuple[float, float]:
         said = self._function(source, target)
-        if isinstance(said, bool | np.bool_):
-            return (0.0, 0.0) if said else (1.0, 1.0)
-        try:
-            lower, upper = map(float, said if isinstance(said, tuple) else (said, said))
-        except (TypeError, ValueError):
-            lower = upper = np.nan
+        lower, upper = map(_error_said, said if isinstance(said, tuple) and len(said) == 2 else (said, said))
         if not 0.0 <= lower <= upper:
             raise ValueError(
                 "relation must return a bool, an error of at least 0, or a pair lower <= upper of such; for the local "
                 f"models of states {source.states[0]} and {target.states[0]} it returned {checks.in_one_line(said)}"
             )
         return lower, upper
+
+
+def _error_said(said) -> float:
+    """A number, or a boolean as 0 where it is true and 1 where it is not; NaN for anything else."""
+    value = said if isinstance(said, str | tuple | None) else np.asarray(said)
+    if not isinstance(value, np.ndarray) or value.shape != () or value.dtype.kind not in "bfiu":
+        return np.nan
+    return float(not value) if value.dtype.kind == "b" else float(value)
 
 
 def _one_minus(kernel) -> Float[np.ndarray, "Q 2"]:

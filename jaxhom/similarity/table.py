@@ -122,6 +122,8 @@ class SimilarityTable:
         checks.refuse_traced(labels=labels, label_weight=label_weight)
         self.distance, self.anchored = checks.require_count("distance", distance), bool(anchored)
         self.labels = None if labels is None else check_labels(self.mdp, labels, label_weight)
+        if labels is None and checks.require_number("label_weight", label_weight) != 1.0:
+            raise ValueError(f"label_weight is {checks.in_one_line(label_weight)}, and there are no labels")
         self.given_relation = relation
         self._maker = LocalModelMaker(host_graph(self.mdp), self.distance, self.labels)
         self._book = ClassBook(self._maker)

@@ -278,7 +278,7 @@ FEATURES = MODEL + "--features states "
         (MODEL + "--voters some", "argument --voters"),
         (MODEL + "--labels features", "--labels features: model.npz has none"),
         (MODEL + "--labels none.npy", "--labels none.npy: not features or reward, and no .npy file"),
-        (MODEL + "--labels reward --label-weight -1", "label_weight must not be negative"),
+        (MODEL + "--labels reward --label-weight -1", "--label-weight must not be negative, got -1.0"),
         (MODEL + "--method monte-carlo", "model.npz: LPAL needs features"),
         (FEATURES, "--features belongs to --lpal"),
         (MODEL + "--lpal-tolerance 1", "--lpal-tolerance belongs to --lpal"),

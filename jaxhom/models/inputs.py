@@ -166,7 +166,7 @@ def check_labels(
 
     Raises:
       ValueError: if a shape does not fit; where values are concrete also if the weight is negative, or naming the first
-        entry that is not finite where its action is allowed, or is too large for the model's type.
+        entry that is not finite where its action is allowed, or is larger than the root of what the model's type holds.
     """
     states, actions = mdp.num_states, mdp.num_actions
     is_traced = checks.is_traced(labels, mdp.allowed)
@@ -189,6 +189,8 @@ def check_labels(
         with np.errstate(over="ignore"):
             weighted = labels * np.asarray(label_weight, mdp.dtype)
         labels = checks.require_floats_in(mdp.dtype, f"label_weight * {name}", weighted)
+        most = float(np.finfo(mdp.dtype).max) ** 0.5
+        checks.require_all(name, labels, np.abs(labels) <= most, f"must be at most {most:.1g} in size")
     xp = np if isinstance(labels, np.ndarray) else jnp
     return labels if by_pair else xp.broadcast_to(labels[:, None], (states, actions, labels.shape[-1]))
 

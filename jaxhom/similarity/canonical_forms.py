@@ -78,12 +78,13 @@ def are_isomorphic(transition: np.ndarray, bits: int, labels: np.ndarray | None 
             continue
         chosen = colour[0, tied].min()
         first = int(np.flatnonzero(colour[0] == chosen)[0])
+        new = _mix(colour[:1, first] + np.uint64(7))
         for image in np.flatnonzero(colour[1] == chosen):
             if left == 0:
                 return None
             left -= 1
             single = colour.copy()
-            single[[0, 1], [first, image]] = _mix(chosen + np.uint64(7))
+            single[[0, 1], [first, image]] = new
             waiting.append(_refine_together(quanta, single))
     return False
 

@@ -145,6 +145,13 @@ def test_the_choice_reports_its_scores(files, capsys):
     assert str(files.arrays("out/policy.npz")["chosen"]) == report["chosen"]
 
 
+def test_a_choice_is_explained_as_it_was_made(files, capsys):
+    """Scores are of all states, whichever is asked about."""
+    arguments = [name for name in files.options() if name != "--output"][:-1]
+    assert main(["explain", "0", *arguments, "--method", "choose"]) == 0
+    assert "State 0:" in capsys.readouterr().out
+
+
 def test_the_global_map_reports_its_bounds(files, monkeypatch, capsys):
     def bounded(mdp, demonstrations, **_):
         return uniform_elsewhere(mdp, demonstrations).replace(error_lower=0.25, error_upper=0.5)

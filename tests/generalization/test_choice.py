@@ -11,6 +11,7 @@ from small_models import dense_transition
 from jaxhom import (
     MDP,
     Demonstrations,
+    SimilarityTable,
     choose_generalization,
     gridworld,
     nearest_neighbors,
@@ -185,6 +186,43 @@ def test_what_cannot_be_chosen(demonstrations, candidates, options, message):
     mdp, shown = world("grid")
     with pytest.raises(ValueError, match=message):
         choose_generalization(mdp, demonstrations or shown, candidates, **options)
+
+
+@pytest.mark.parametrize(
+    ("candidate", "message"),
+    [
+        (lambda mdp, shown: np.full((36, 4), np.nan), r"the policy of candidates\['odd'\]\[0, 0\] must be finite"),
+        (lambda mdp, shown: np.full((36, 4), 30.0), r"the policy of candidates\['odd'\]"),
+        (lambda mdp, shown: None, r"the policy of candidates\['odd'\]"),
+        ({"threshold": -1.0}, r"candidates\['odd'\]: threshold must not be negative"),
+        ({"relation": "none"}, r"candidates\['odd'\]: relation must be one of"),
+        ({"distance": [1]}, r"candidates\['odd'\]: distance must be a whole number"),
+        ({"states": [5, 1]}, r"candidates\['odd'\]: states must have shape"),
+        ({"progress": True}, r"candidates\['odd'\] has the option 'progress', which is none of distance"),
+    ],
+)
+def test_candidates_are_named_where_they_are_wrong(candidate, message):
+    mdp, shown = world("grid")
+    with pytest.raises(ValueError, match=message):
+        choose_generalization(mdp, shown, {"plain": {}, "odd": candidate})
+
+
+@pytest.mark.parametrize("options", [{"mixing": "x"}, {"caution": None}, {"states": np.arange(36)}])
+def test_options_of_other_kinds(options):
+    mdp, shown = world("grid")
+    with pytest.raises(ValueError, match=rf"{next(iter(options))} must be a"):
+        choose_generalization(mdp, shown, **options)
+
+
+def test_a_candidate_may_bring_its_table():
+    mdp, shown = world("grid")
+    labels, weight = np.random.default_rng(0).integers(0, 2, (36, 1)), np.array(0.5)
+    table = SimilarityTable(mdp, relation="lax", labels=labels, label_weight=weight)
+    own = {"relation": "lax", "labels": labels}
+    found = choose_generalization(mdp, shown, {"table": {"table": table}, "own": own}, label_weight=weight)
+    assert found.scores["table"] == pytest.approx(found.scores["own"], abs=1e-12)
+    with pytest.raises(ValueError, match=r"candidates\['odd'\]: table was made with relation='lax'"):
+        choose_generalization(mdp, shown, {"odd": {"table": table, "relation": "isomorphic"}})
 
 
 def test_not_inside_programs():

@@ -231,3 +231,46 @@ def test_everybody_at_an_infinite_threshold():
     assert np.all(general.support[~np.asarray(general.visited)] == np.asarray(general.visited).sum())
     weighed = [mdp.num_states - np.asarray(general.visited).sum()]
     assert weighed[0] > 0 and np.allclose(np.asarray(general.policy).sum(axis=1), 1.0)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("voters", ["nearest", 2, "all"])
+@pytest.mark.parametrize("temperature", [1e-5, 1e-3, 1e3])
+def test_weights_never_vanish(dtype, voters, temperature):
+    """However low the temperature: the most similar voter decides, on the host and inside programs."""
+    transition = oracles.random_mdp(np.random.default_rng(0), 12, 2, N=2)[0].astype(dtype)
+    mdp = MDP.from_dense(transition, discount=0.9)
+    shown = Demonstrations.from_trajectories([([0, 1, 2], [0, 1, 0])])
+    table = SimilarityTable(mdp).complete(1.0, with_errors=True, tolerance=1e-3)
+    rule = {"threshold": 1.0, "voters": voters, "weights": "similarity", "temperature": temperature, "tolerance": 1e-3}
+    learn = functools.partial(soft_local_homomorphism, mdp, table=table, **rule)
+    with pytest.warns(UserWarning):
+        inside, outside = jax.jit(learn)(shown), learn(shown)
+    np.testing.assert_array_equal(inside.support, outside.support)
+    np.testing.assert_array_equal(inside.radius, outside.radius)
+    np.testing.assert_allclose(inside.policy, outside.policy, atol=1e-5)
+    plain = soft_local_homomorphism(mdp, shown, table=table, **{**rule, "weights": "equal"})
+    np.testing.assert_array_equal(outside.support, plain.support)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"temperature": "0.5"}, "temperature must be a number, got '0.5'"),
+        ({"threshold": None}, "threshold must be a number, got None"),
+        ({"tolerance": [0.1]}, r"tolerance must be a number, got \[0.1\]"),
+        ({"voters": True}, "voters must be a whole number, got True"),
+        ({"states": np.arange(36)}, "states must be a mask of booleans"),
+        ({"states": [True]}, r"states must have shape \(36,\)"),
+    ],
+)
+def test_options_of_other_kinds(options, message):
+    mdp, demonstrations, _ = world("grid")
+    with pytest.raises(ValueError, match=message):
+        soft_local_homomorphism(mdp, demonstrations, **options)
+
+
+def test_numbers_of_any_kind():
+    mdp, demonstrations, _ = world("grid")
+    options = {"voters": np.array(2), "threshold": np.float32(0.25), "temperature": np.array(0.5)}
+    assert soft_local_homomorphism(mdp, demonstrations, weights="similarity", **options).status == 0

@@ -218,3 +218,26 @@ def test_two_models_inside_programs():
 def test_what_does_not_fit_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         local_similarity(model(), *PAIRS, **options)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "size"), [(np.float32, 100.0), (np.float32, 1e9), (np.float64, 2e8), (np.float64, 1e100)]
+)
+def test_copies_are_alike_however_large_their_labels(dtype, size):
+    """A ring of six, all alike; then one label is another."""
+    transition = np.zeros((6, 2, 6), dtype)
+    for s in range(6):
+        transition[s, 0, (s + 1) % 6] = transition[s, 1, (s - 1) % 6] = 1.0
+    mdp = MDP.from_dense(transition, discount=0.9)
+    labels = np.full((6, 1), -size, dtype)
+    found = SimilarityTable(mdp, labels=labels).decisions([0, 0], [0, 3])
+    assert found.similar.all() and np.all(found.status == 0)
+    labels[3] = 0.5 * size
+    assert SimilarityTable(mdp, labels=labels).decide([0, 0], [0, 3]).tolist() == [True, False]
+
+
+def test_labels_without_end_and_a_weight_without_labels_are_refused():
+    with pytest.raises(ValueError, match=r"labels\[0, 0\] must be at most 1e\+154 in size, got 1e\+308"):
+        SimilarityTable(model(), labels=np.full((7, 1), 1e308))
+    with pytest.raises(ValueError, match="label_weight is 2.0, and there are no labels"):
+        SimilarityTable(model(), label_weight=2.0)

@@ -3,12 +3,13 @@
 import functools
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
 from small_models import dense_transition
 
-from jaxhom import MDP, SimilarityTable, Status, gridworld
+from jaxhom import MDP, SimilarityTable, Status, disjoint_union, gridworld
 from jaxhom.similarity.graph_kernels import NUM_ROUNDS, NUM_STEPS, walks_in_common
 
 PAIRS = np.array(list(itertools.product(range(6), range(6)))).T
@@ -258,3 +259,70 @@ def test_bounds_serve_all_thresholds():
     table.complete(0.0)
     table.decide(*PAIRS, 0.2)
     assert table.num_solved == solved
+
+
+def cycles(lengths, order):
+    """A centre that leads to all states of some cycles, numbered in some order."""
+    size = 1 + sum(lengths)
+    transition, first = np.zeros((size, 1, size)), 1
+    transition[0, 0, 1:] = 1.0 / (size - 1)
+    for length in lengths:
+        here = first + np.arange(length)
+        transition[here, 0, np.roll(here, 1)] += 0.5
+        transition[here, 0, np.roll(here, -1)] += 0.5
+        first += length
+    renamed = np.append(0, 1 + np.asarray(order))
+    return transition[renamed][:, :, renamed]
+
+
+@pytest.mark.parametrize("lengths", [(6, 3, 3), (40,), (5, 5, 5, 5)])
+def test_isomorphic_models_that_refinement_does_not_tell(lengths):
+    """All states but the centre look the same to colours, and ties can be broken badly."""
+    rng, size = np.random.default_rng(0), sum(lengths)
+    models = [MDP.from_dense(cycles(lengths, rng.permutation(size)), discount=0.9) for _ in range(4)]
+    union = disjoint_union(models)
+    table = SimilarityTable(union, relation="isomorphic")
+    assert table.decide(np.repeat(union.offsets, 4), np.tile(union.offsets, 4)).all()
+    found = table.brackets(union.offsets[:1], union.offsets[1:2])
+    assert found.lower[0] == 0.0 and found.upper[0] < 1e-9
+
+
+def test_models_of_the_same_colours_that_are_not_isomorphic():
+    union = disjoint_union([MDP.from_dense(cycles(one, range(12)), discount=0.9) for one in ((6, 6), (4, 4, 4), (12,))])
+    starts = union.offsets
+    found = SimilarityTable(union, relation="isomorphic").brackets(np.repeat(starts, 3), np.tile(starts, 3))
+    assert found.upper.round(9).tolist() == [0, 1, 1, 1, 0, 1, 1, 1, 0]
+    kernel = SimilarityTable(union, relation="weisfeiler_lehman").brackets(starts[:1], starts[1:2])
+    assert kernel.upper[0] < 1e-9  # which is why it is another relation
+
+
+def test_booleans_of_any_kind_say_the_same():
+    mdp = model()
+    expected = SimilarityTable(mdp, relation="isomorphic").decide(*PAIRS)
+    iso = SimilarityTable(mdp, relation="isomorphic")
+    for kind in (bool, np.bool_, np.array, jnp.asarray):
+
+        def relation(source, target, kind=kind):
+            return kind(bool(iso.decide(source.states[:1], target.states[:1])[0]))
+
+        assert np.array_equal(SimilarityTable(mdp, relation=relation).decide(*PAIRS), expected)
+
+
+def test_lax_renamings_do_not_depend_on_what_was_asked_before():
+    """Of permutations whose errors differ by less than 1e-4 the first one counts, however close the brackets."""
+    transition = np.zeros((6, 2, 6))
+    for first, chances in ((0, (0.5, 0.50004)), (3, (0.50004, 0.5))):
+        for action, chance in enumerate(chances):
+            transition[first, action, [first + 1, first + 2]] = chance, 1.0 - chance
+        transition[first + 1, :, first + 1] = transition[first + 2, :, first] = 1.0
+    mdp = MDP.from_dense(transition, discount=0.9)
+    for tolerance in (None, 1e-6, 1e-4, 0.9):
+        table = SimilarityTable(mdp, relation="lax")
+        if tolerance is not None:
+            table.brackets([0], [3], tolerance=tolerance)
+        assert table.renamings([0], [3]).tolist() == [[0, 1]]
+
+
+def test_lax_maps_are_as_close_as_others():
+    found = SimilarityTable(model("deterministic"), relation="lax").maps(*PAIRS)
+    assert np.all(found.status == Status.SOLVED)

@@ -47,7 +47,7 @@ def related(problem: Problem, *, is_labelled: bool = False, **options) -> Learne
     return soft(problem, **options, **({"labels": problem.domain.labels} if is_labelled else {}))
 
 
-def chosen(problem: Problem, *, is_labelled: bool = False, caution: float | None = None) -> Learned:
+def chosen(problem: Problem, *, caution: float, is_labelled: bool = False) -> Learned:
     """The choice among the default candidates, with the labels of the domain; tables are shared by draws."""
     domain, name = problem.domain, problem.setting.domain
     labels = domain.labels if is_labelled else None
@@ -57,7 +57,7 @@ def chosen(problem: Problem, *, is_labelled: bool = False, caution: float | None
             candidates[key] = {**one, "table": shared_table(name, 1, is_labelled, relation=one["relation"])}
     states = None if domain.terminal is None else ~np.asarray(domain.terminal)
     pairs = zip(problem.models, problem.demonstrations, strict=True)
-    options = {"labels": labels, "states": states} | ({} if caution is None else {"caution": caution})
+    options = {"labels": labels, "states": states, "caution": caution}
     found = [jaxhom.choose_generalization(*pair, candidates, **options).best for pair in pairs]
     return Learned(jnp.stack([one.policy for one in found]), np.array([int(one.status) for one in found]))
 
@@ -110,9 +110,9 @@ def _methods(chosen_ones: Mapping[str, Mapping[str, Any]], **more) -> dict[str, 
 
 
 def _choices(**options) -> dict[str, Method]:
-    """The choice by default, and that of the highest score."""
-    bold = functools.partial(chosen, caution=0.0, **options)
-    return {"chosen": functools.partial(chosen, **options), "chosen, highest score": bold}
+    """The choice that has to beat earlier candidates by two standard errors, and that of the highest score."""
+    careful, bold = (functools.partial(chosen, caution=caution, **options) for caution in (2.0, 0.0))
+    return {"chosen": careful, "chosen, highest score": bold}
 
 
 _CONTROLS: dict[str, Method] = {"expert": expert, "uniform": maximum_entropy, "k-NN": manhattan_knn}

@@ -31,9 +31,13 @@ length, the expectations hardly count against occupancies that sum to 1 / (1 - d
 evenly over the regions, which earns about the mean weight, 0.05 a step. The printed numbers are of that size."""
 
 _RELATIONS_NOTE = """Percent of the expert's reward per step, in trials of the setting's length: on lakes the share of
-time in the goal. Bold where it is further from Algorithm 1 at threshold 0 than both intervals together. `chosen` is
-`choose_generalization` with its default candidates; those with other voters are not among them. Per setting, the choice
-against the candidate with the best mean, in points:"""
+time in the goal. Bold where it is further from Algorithm 1 at threshold 0 than both intervals together. Nothing is best
+everywhere: what serves tracks, actions that are renamed, loses on grids and lakes.
+
+`chosen, highest score` is `choose_generalization` with its default candidates, `chosen` the same with `caution=2`;
+those with other voters are not among the candidates. What is likeliest is not what is worth most, most of all on lakes,
+where a wrong step matters more in some states than in others, and few states are left out with a trajectory. Per
+setting, the choice against the candidate with the best mean, in points:"""
 _ROADS_NOTE = """A network of 1,042 directed links with a destination that absorbs; the expert takes the fewest links.
 The label of an exit is the detour that it means in length, so that the smallest label alone, without a demonstration,
 is nearly the expert: what labels add to the votes carries that prior. The candidates of `chosen` have them too. Per

@@ -71,16 +71,15 @@ def choose_generalization(
     label_weight: float = 1.0,
     states: Bool[ArrayLike, " S"] | None = None,
     mixing: float | None = None,
-    caution: float = 2.0,
+    caution: float = 0.0,
     progress: bool = False,
 ) -> Choice:
     """Chooses among ways to generalize by the likelihood of trajectories that were left out.
 
     Each trajectory is left out in turn. A candidate's score is the mean, over all their steps, of log((1 - mixing)
-    pi(s, a) + mixing u(s, a)): pi is what it makes of the others, u is uniform over the allowed actions. The winner is
-    the first candidate whose score is not told from the highest one: within so many standard errors, those of the
-    difference between trajectories, as `caution` says. A few trajectories tell little, so those come first that accept
-    least.
+    pi(s, a) + mixing u(s, a)): pi is what it makes of the others, u is uniform over the allowed actions. The highest
+    score wins, the first one of equal ones; among the defaults those come first that accept least. What is likeliest
+    need not be worth most: `bench/results/report.md` has how far the choice is from the best.
 
     Args:
       mdp: the model.
@@ -95,7 +94,8 @@ def choose_generalization(
         candidate has the share, from 1 % on, under which it is likeliest: with little of it one that is right in half
         of the states, which may be by far the best, would score below `uniform_elsewhere`. In states that other
         trajectories visit too, where there is nothing to generalize, it is 5 %.
-      caution: at least 0, see above; with 0 the highest score wins.
+      caution: at least 0. The winner is the first candidate whose score is within so many standard errors, those of the
+        difference between trajectories, of the highest one: with 1 or 2 an earlier candidate has to be beaten clearly.
       progress: show a progress bar.
 
     Returns:

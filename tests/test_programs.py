@@ -127,6 +127,10 @@ def cases() -> dict[str, Case]:
         "disjoint_union": Case(
             lambda scale: jaxhom.disjoint_union([mdp, mdp.replace(features=scale * mdp.features)]).mdp.features, one
         ),
+        "choose_generalization": Case(
+            lambda scale: jaxhom.choose_generalization(mdp.replace(features=scale * mdp.features), walks).best.policy,
+            one,
+        ),
         "uniform_elsewhere": Case(
             lambda walks: jaxhom.uniform_elsewhere(mdp, walks),
             walks,

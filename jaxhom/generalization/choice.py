@@ -84,10 +84,11 @@ def choose_generalization(
     Args:
       mdp: the model.
       demonstrations: M >= 2 trajectories with steps.
-      candidates: by name, the options of `soft_local_homomorphism` as a mapping; or a function of a model and
-        demonstrations, such as `nearest_neighbors`, `uniform_elsewhere` or one of the user's. `default_candidates` says
-        which if None: isomorphism, and Weisfeiler-Lehman, LP (9), random walks and, for up to 6 actions, "lax" at three
-        thresholds, k-NN, and uniform; with labels also LP (9) and random walks with all voters, weighted.
+      candidates: by name, the options of `soft_local_homomorphism` as a mapping, a `table` among them; or a function of
+        a model and demonstrations, such as `nearest_neighbors`, `uniform_elsewhere` or one of the user's. If None
+        `default_candidates` says which: isomorphism, and Weisfeiler-Lehman, LP (9), random walks and, for up to 6
+        actions, "lax" at three thresholds, k-NN, and uniform; with labels also LP (9) and random walks with all voters,
+        weighted.
       distance, labels, label_weight, states: what `soft_local_homomorphism` takes, for candidates that do not say
         otherwise. Steps in states that are left out do not count.
       mixing: in (0, 1], the share of the uniform policy, without which one wrong step would decide. If None each

@@ -165,15 +165,17 @@ class _Isomorphic(_WithoutPrograms):
 class _WeisfeilerLehman(_WithoutPrograms):
     """1 - k for the normalised Weisfeiler-Lehman kernel."""
 
-    _features = None
+    _num_classes = 0
 
     def _bounds(self, pairs, progress):
-        models = self._models
-        if self._features is None or self._features.shape[0] < len(models.size):
-            known = [models.alone(number, is_scaled=True) for number in range(len(models.size))]
+        if self._num_classes < len(self._models.size):
+            self._num_classes = len(self._models.size)
+            is_small = ~is_oversized(self._models.size, self._models.num_actions)
+            self._row = np.cumsum(is_small) - 1
+            known = [self._models.alone(number, is_scaled=True) for number in np.flatnonzero(is_small)]
             self._features = colour_counts(known, quantum_bits(self._dtype), anchored=self._anchored)
         progress(len(pairs))
-        return _one_minus(cosines(self._features, pairs))
+        return _one_minus(cosines(self._features, self._row[pairs]))
 
 
 class _RandomWalk(_WithoutPrograms):

@@ -377,7 +377,7 @@ def test_demonstrations_of_another_model_are_refused(name, trajectory, message):
     ("options", "message"),
     [
         ({"threshold": -0.1}, "threshold must not be negative, got -0.1"),
-        ({"threshold": np.nan}, "threshold must not be negative, got nan"),
+        ({"threshold": np.nan}, "threshold must be a number, got nan"),
         ({"tolerance": 0.0}, "tolerance must be positive, got 0.0"),
         ({"distance": 0}, "distance must be at least 1, got 0"),
     ],

@@ -10,6 +10,7 @@ import pytest
 from small_models import dense_transition
 
 from jaxhom import MDP, SimilarityTable, Status, disjoint_union, gridworld
+from jaxhom.similarity import local_models
 from jaxhom.similarity.graph_kernels import NUM_ROUNDS, NUM_STEPS, walks_in_common
 
 PAIRS = np.array(list(itertools.product(range(6), range(6)))).T
@@ -326,3 +327,18 @@ def test_lax_renamings_do_not_depend_on_what_was_asked_before():
 def test_lax_maps_are_as_close_as_others():
     found = SimilarityTable(model("deterministic"), relation="lax").maps(*PAIRS)
     assert np.all(found.status == Status.SOLVED)
+
+
+@pytest.mark.parametrize("relation", ["isomorphic", "weisfeiler_lehman", "random_walk"])
+def test_hubs_too_large_to_be_looked_at_stay_undecided(relation, monkeypatch):
+    """Two hubs lead to many states each, of which every other leads back and the rest stay."""
+    monkeypatch.setattr(local_models, "_MAX_ENTRIES", 500)
+    transition, size = np.zeros((82, 2, 82)), 40
+    for hub in (0, 1):
+        spokes = 2 + hub * size + np.arange(size)
+        transition[hub, :, spokes] = 1.0 / size
+        transition[spokes[::2], :, spokes[::2]] = transition[spokes[1::2], :, hub] = 1.0
+    table = SimilarityTable(MDP.from_dense(transition, discount=0.9), relation=relation)
+    found = table.decisions([0, 0, 2, 2], [0, 1, 4, 0], 0.1)
+    assert found.similar.tolist() == [relation == "isomorphic", False, True, False]
+    assert found.status.tolist()[1:] == [Status.ITERATION_LIMIT, Status.SOLVED, Status.ITERATION_LIMIT]

@@ -197,20 +197,22 @@ def largest_difference(rows: Iterable[Row], track: str, one: str, other: str) ->
 
 
 def choice_words(rows: Iterable[Row], chooser: str, chosen_from: Sequence[str]) -> list[str]:
-    """For every setting, how far the choice is below the candidate with the best mean, paired by draw, in points."""
+    """For every setting, how far the choice is below the candidate with the best mean, in points, in its draws."""
     words, behind = [], 0
     for (domain, count), group in grouped(frame(rows), "domain", "demonstrations"):
         ratios = 100.0 * group.pivot(index="draw", columns="method", values="ratio")
-        candidates = ratios[[name for name in chosen_from if name in ratios and name != "expert"]]
         if chooser not in ratios:  # its rows failed, or were not asked for
             continue
+        ratios = ratios[ratios[chooser].notna()]
+        candidates = ratios[[name for name in chosen_from if name in ratios and name != "expert"]]
         best = candidates.mean().idxmax()
         own, ahead = mean_interval(candidates[best]), mean_interval((ratios[chooser] - candidates[best]).dropna())
         is_behind = ahead.high < 0.0 and ahead.mean < -own.half_width
         behind += is_behind
         verdict = "behind by more than one interval" if is_behind else "within one interval"
         words.append(
-            f"{domain}, {count} demonstrations: {ratios[chooser].mean():.1f} against {own.mean:.1f} +- "
-            f"{own.half_width:.1f} of {best}, {ahead.mean:+.1f} ({ahead.low:+.1f} to {ahead.high:+.1f}): {verdict}."
+            f"{domain}, {count} demonstrations, {len(ratios)} draws: {ratios[chooser].mean():.1f} against "
+            f"{own.mean:.1f} +- {own.half_width:.1f} of {best}, "
+            f"{ahead.mean:+.1f} ({ahead.low:+.1f} to {ahead.high:+.1f}): {verdict}."
         )
     return [f"{behind} of {len(words)} settings are behind by more than one interval.", *words]

@@ -63,12 +63,23 @@ class LaxPairs:
 
     def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, *, progress: bool = False) -> LocalSimilarity:
         """Bounds on the least errors of different ordered pairs of classes."""
-        parts = np.array_split(pairs, 1 + len(pairs) * len(self._orders) // _CHUNK)
-        found = [self._least_errors(part, goal, progress) for part in parts]
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
+        apart = self._errors_of_actions(pairs, goal)
+        # Every action stands for some other, and some other for it, whatever the permutation.
+        floor = np.maximum(apart.min(axis=2).max(axis=1), apart.min(axis=1).max(axis=1)).astype(self._programs.dtype)
+        result = LocalSimilarity(
+            lower=floor,
+            upper=np.full(len(pairs), self._programs.most, floor.dtype),
+            iterations=np.zeros(len(pairs), np.int32),
+            status=np.full(len(pairs), Status.SOLVED, np.int32),
+        )
+        (waiting,) = np.nonzero(~(floor > goal.threshold))
+        for part in np.array_split(waiting, 1 + len(waiting) * len(self._orders) // _CHUNK):
+            found = self._least_errors(pairs[part], apart[part], goal, progress)
+            jax.tree.map(lambda place, new, part=part: np.put(place, part, new), result, found)
+        return result
 
-    def _least_errors(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, progress: bool) -> LocalSimilarity:
-        lower, best = self._bounds_by_actions(pairs, goal), np.full(len(pairs), np.inf)
+    def _least_errors(self, pairs, apart: Float[np.ndarray, "Q A A"], goal: Goal, progress: bool) -> LocalSimilarity:
+        lower, best = self._bounds_by_actions(apart), np.full(len(pairs), np.inf)
         chosen_upper, chosen = np.full(len(pairs), np.inf), np.zeros(len(pairs), int)
         iterations, status = np.zeros(len(pairs), np.int32), np.full(len(pairs), Status.SOLVED, np.int32)
         for rank in range(len(self._orders)):
@@ -124,12 +135,15 @@ class LaxPairs:
         """The pairs with the actions of the targets renamed, as `_RenamedModels` numbers them."""
         return pairs + np.array([0, rank * len(self._models.size)])
 
-    def _bounds_by_actions(self, pairs, goal: Goal) -> Float[np.ndarray, "Q R"]:
-        """Lower bounds for every permutation: no error is below that of any one action with the one renamed to it."""
-        result, actions = np.zeros((len(pairs), len(self._orders))), np.arange(self._orders.shape[1])
+    def _errors_of_actions(self, pairs, goal: Goal) -> Float[np.ndarray, "Q A A"]:
+        """Lower bounds where an action of the target stands for one of the source, as far as the goal asks for."""
         if not self._anchored:  # a single action then has little to say
-            return result
-        apart = self._actions.errors(pairs, goal._replace(threshold=goal.threshold if goal.decides else 0.0))
+            return np.zeros((len(pairs), *(self._orders.shape[1],) * 2))
+        return self._actions.errors(pairs, goal._replace(threshold=goal.threshold if goal.decides else 0.0))
+
+    def _bounds_by_actions(self, apart: Float[np.ndarray, "Q A A"]) -> Float[np.ndarray, "Q R"]:
+        """Lower bounds for every permutation: no error is below that of any one action with the one renamed to it."""
+        result, actions = np.zeros((len(apart), len(self._orders))), np.arange(self._orders.shape[1])
         for order, bounds in zip(self._orders, result.T, strict=True):
             bounds[:] = apart[:, actions, order].max(axis=1)
         return result

@@ -38,7 +38,7 @@ everywhere: what serves tracks, actions that are renamed, loses on grids and lak
 those with other voters are not among the candidates. What is likeliest is not what is worth most, most of all on lakes,
 where a wrong step matters more in some states than in others, and few states are left out with a trajectory. Per
 setting, the choice against the candidate with the best mean, in points:"""
-_ROADS_NOTE = """A network of 1,042 directed links with a destination that absorbs; the expert takes the fewest links.
+_ROADS_NOTE = """A network of 1,110 directed links with a destination that absorbs; the expert takes the fewest links.
 The label of an exit is the detour that it means in length, so that the smallest label alone, without a demonstration,
 is nearly the expert: what labels add to the votes carries that prior. The candidates of `chosen` have them too. Per
 number of trips, the choice against the candidate with the best mean, in points:"""

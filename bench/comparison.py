@@ -198,7 +198,7 @@ def largest_difference(rows: Iterable[Row], track: str, one: str, other: str) ->
 
 def choice_words(rows: Iterable[Row], chooser: str, chosen_from: Sequence[str]) -> list[str]:
     """For every setting, how far the choice is below the candidate with the best mean, in points, in its draws."""
-    words, behind = [], 0
+    words, behind, differences = [], 0, []
     for (domain, count), group in grouped(frame(rows), "domain", "demonstrations"):
         ratios = 100.0 * group.pivot(index="draw", columns="method", values="ratio")
         if chooser not in ratios:  # its rows failed, or were not asked for
@@ -209,10 +209,12 @@ def choice_words(rows: Iterable[Row], chooser: str, chosen_from: Sequence[str]) 
         own, ahead = mean_interval(candidates[best]), mean_interval((ratios[chooser] - candidates[best]).dropna())
         is_behind = ahead.high < 0.0 and ahead.mean < -own.half_width
         behind += is_behind
+        differences.append(ahead.mean)
         verdict = "behind by more than one interval" if is_behind else "within one interval"
         words.append(
             f"{domain}, {count} demonstrations, {len(ratios)} draws: {ratios[chooser].mean():.1f} against "
             f"{own.mean:.1f} +- {own.half_width:.1f} of {best}, "
             f"{ahead.mean:+.1f} ({ahead.low:+.1f} to {ahead.high:+.1f}): {verdict}."
         )
-    return [f"{behind} of {len(words)} settings are behind by more than one interval.", *words]
+    average = f"{np.mean(differences):+.1f} points on average" if words else "none has rows"
+    return [f"{behind} of {len(words)} settings are behind by more than one interval; {average}.", *words]

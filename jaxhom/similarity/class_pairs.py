@@ -87,7 +87,9 @@ class ClassModels:
     def of_pairs(self, pairs: np.ndarray) -> Iterator[tuple[np.ndarray, LocalModels, LocalModels]]:
         """Numbers of different pairs of classes [Q, 2] of a few sizes, and their models; none that are too large."""
         groups = _Groups(pairs, self)
-        groups.of_pair = np.where(groups.of_pair == _SAME, groups.of_class[pairs], groups.of_pair)
+        is_small = ~is_oversized(self.size, self.num_actions)[pairs]
+        of_class = np.where(is_small, groups.of_class[pairs], _TOO_LARGE)
+        groups.of_pair = np.where(groups.of_pair == _SAME, of_class, groups.of_pair)
         for members, widths in groups.members():
             for index in self.chunks(members, widths):
                 yield index, *(self.of(classes, width) for classes, width in zip(pairs[index].T, widths, strict=True))

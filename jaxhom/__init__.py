@@ -11,6 +11,7 @@ from jaxhom import interrupts
 
 interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
 
+from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.lpal import LPAL, LPALMethod, LPALSolution, lpal
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
@@ -58,6 +59,7 @@ __all__ = [
     "ImpossibleStepsWarning",
     "LPALMethod",
     "LPALSolution",
+    "Learned",
     "LocalSimilarity",
     "Plan",
     "Racetrack",

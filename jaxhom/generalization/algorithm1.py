@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.generalization import evidence, votes_in_program
+from jaxhom.generalization import votes_in_program
 from jaxhom.generalization.explainers import ByHomomorphism
 from jaxhom.generalization.result import Generalization, extend
 from jaxhom.generalization.uniform import uniform_elsewhere
@@ -22,7 +22,7 @@ from jaxhom.generalization.votes import policies_that_count
 from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model, asked_states
-from jaxhom.models.mdp import MDP
+from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.similarity.given_table import table_for
 from jaxhom.similarity.relations import UserRelation
 from jaxhom.similarity.table import SimilarityTable
@@ -143,7 +143,7 @@ def _vote_on_host(mdp: MDP, start: Generalization, asking: np.ndarray, table: Si
     """The votes around the states that ask, bool [S], and `undecided` and `status`; solves the pairs that it meets."""
     visited, policy = np.asarray(start.visited), np.asarray(start.policy)
     # All classes that will be met, at once: programs are as wide as the widest class that is known.
-    met = asking | evidence.deciding(mdp, visited)
+    met = asking | deciding_states(mdp, visited)
     group = np.zeros(mdp.num_states, np.int32)
     group[met] = table.classes(np.flatnonzero(met))
     ballots = HostBallots(mdp, table, rule, policies_that_count(mdp, visited, policy), progress)

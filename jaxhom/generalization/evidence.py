@@ -2,8 +2,7 @@
 
 Two rules, whatever the method that carries the expert's policy over:
 
-* What was done in an absorbing state is no evidence: an episode's end is no decision, and every local model maps onto
-  such a state with error 0. So it makes no difference whether demonstrations stop at the goal or walk on in it.
+* What was done in an absorbing state is no evidence (`jaxhom.models.mdp.deciding_states`).
 * Votes for actions that a state lacks do not count. A demonstrated state whose votes all are for such actions has no
   vote there.
 """
@@ -11,14 +10,7 @@ Two rules, whatever the method that carries the expert's policy over:
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.models.mdp import MDP, absorbing_states, uniform_policy
-
-
-def deciding(mdp: MDP, visited):
-    """bool [S]: the demonstrated states in which there was something to decide."""
-    absorbs = absorbing_states(mdp)
-    xp = checks.arrays_of(visited, absorbs)
-    return xp.asarray(visited) & ~xp.asarray(absorbs)
+from jaxhom.models.mdp import MDP, uniform_policy
 
 
 def has_vote(mdp: MDP, policy, states, experts):

@@ -15,7 +15,7 @@ from jaxhom.generalization.explanation import Explanation
 from jaxhom.generalization.votes import is_nearest, policies_that_count, square_distances
 from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.graph import steps_from
-from jaxhom.models.mdp import MDP
+from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.similarity.table import SimilarityTable
 
 LEAST_SHARE = 1e-3  # of the global map, for a demonstrated state to count as a voter
@@ -185,7 +185,7 @@ def demonstrated(general: Generalized, state: int) -> Explanation:
 
 def _experts(mdp: MDP, general: Generalized, state: int) -> np.ndarray:
     """The demonstrated states that have a vote in a state, by number."""
-    experts = np.flatnonzero(evidence.deciding(mdp, general.visited))
+    experts = np.flatnonzero(deciding_states(mdp, general.visited))
     return experts[evidence.has_vote(mdp, general.policy, np.full(len(experts), state), experts)]
 
 

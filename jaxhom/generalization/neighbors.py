@@ -16,7 +16,7 @@ from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.generalization.votes import Votes, plain_ballots, vote_of_nearest, vote_of_rings
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model, check_coordinates
-from jaxhom.models.mdp import MDP
+from jaxhom.models.mdp import MDP, deciding_states
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float
@@ -79,7 +79,7 @@ def nearest_neighbors(
         votes = vote_of_rings(mdp, visited, policy, ~visited, plain_ballots(mdp, visited, policy))
         return extend(mdp, start, votes, ByHops(mdp))
     accept = functools.partial(evidence.has_vote, mdp, policy) if mdp.restricts_actions else None
-    votes = vote_of_nearest(evidence.deciding(mdp, visited), policy, coordinates, accept)
+    votes = vote_of_nearest(deciding_states(mdp, visited), policy, coordinates, accept)
     return extend(mdp, start, votes, ByCoordinates(mdp, coordinates))
 
 

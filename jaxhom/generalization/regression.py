@@ -23,12 +23,11 @@ import numpy as np
 import scipy
 
 from jaxhom import checks
-from jaxhom.generalization import evidence
 from jaxhom.generalization.explainers import ByOccupancy
 from jaxhom.generalization.result import Generalization
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_coordinates
-from jaxhom.models.mdp import MDP, uniform_policy
+from jaxhom.models.mdp import MDP, deciding_states, uniform_policy
 from jaxhom.planning.flow_matrix import flow_matrix
 from jaxhom.planning.occupancy import has_occupancy, policy_from_occupancy
 from jaxhom.solvers.normal_equations import Rows
@@ -81,7 +80,7 @@ def occupancy_regression(
         )
     basis = quadratic_basis(check_coordinates(mdp, coordinates))
     visited, empirical = (np.asarray(array) for array in empirical_policy(mdp, demonstrations))
-    decides = evidence.deciding(mdp, visited)
+    decides = deciding_states(mdp, visited)
     x = _solve(mdp, basis, _expansion(mdp, decides, empirical)).reshape(empirical.shape)
     occurs, policy = has_occupancy(mdp, x), policy_from_occupancy(mdp, x, np.asarray(uniform_policy(mdp)))
     found = np.where(occurs, 1, -1)

@@ -22,7 +22,7 @@ from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model, check_labels
-from jaxhom.models.mdp import MDP
+from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.similarity.local_models import restricted_model
 from jaxhom.status import Status
 
@@ -154,7 +154,7 @@ def soft_homomorphism(
         found = _map_in_program(mdp, experts, kept, anchored, effort)
         votes = votes_in_program.sum_of_policies(found.mapping, start.policy, experts)
         return _generalization(mdp, start, found, votes)
-    experts = np.flatnonzero(evidence.deciding(mdp, start.visited))
+    experts = np.flatnonzero(deciding_states(mdp, start.visited))
     found = _map_on_host(mdp, experts, kept, anchored, effort)
     explainer = ByGlobalMap(mdp, experts, found.mapping, float(found.lower), float(found.upper), anchored)
     votes = found.mapping @ np.asarray(start.policy)[experts]

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxhom.generalization import evidence
 from jaxhom.models.graph import reachable_within
-from jaxhom.models.mdp import MDP
+from jaxhom.models.mdp import MDP, deciding_states
 
 _CHUNK_BYTES = 64 * 2**20  # of distances at a time
 Ballots = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -30,7 +30,7 @@ class Votes(NamedTuple):
 
 def policies_that_count(mdp: MDP, visited, policy) -> Ballots:
     """The expert's `policy` [S, A] in the demonstrated states that decide, whoever asks."""
-    rows = np.where(evidence.deciding(mdp, visited)[:, None], policy, 0.0)
+    rows = np.where(deciding_states(mdp, visited)[:, None], policy, 0.0)
     return lambda states, experts: rows[experts]
 
 

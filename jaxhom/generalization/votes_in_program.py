@@ -23,7 +23,7 @@ from jaxhom.generalization.votes import TIE, Votes, is_nearest, square_distances
 from jaxhom.generalization.voting import VotingRule
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.graph import host_graph
-from jaxhom.models.mdp import MDP
+from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.models.padded_rows import narrow_width
 from jaxhom.similarity.decisions import Relation
 from jaxhom.similarity.table import SimilarityTable
@@ -63,7 +63,7 @@ class _Search(NamedTuple):
 def padded_experts(mdp: MDP, demonstrations: Demonstrations, visited) -> jax.Array:
     """int32 [E]: the demonstrated states that decide, ascending, then S; E is all states or all steps, if fewer."""
     length = min(mdp.num_states, demonstrations.states.size)
-    decides = evidence.deciding(mdp, visited)
+    decides = deciding_states(mdp, visited)
     return jnp.nonzero(decides, size=length, fill_value=mdp.num_states)[0].astype(jnp.int32)
 
 

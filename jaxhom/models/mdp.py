@@ -271,6 +271,17 @@ def absorbing_states(mdp: MDP) -> Bool[Array, " S"]:
     return ~(leaves & (xp.asarray(mdp.probability) > 0)).any(axis=(1, 2))
 
 
+def deciding_states(mdp: MDP, visited: Bool[Array, " S"]) -> Bool[Array, " S"]:
+    """The demonstrated states in which there was something to decide; in NumPy at hand, also under `jit` and `vmap`.
+
+    What was done in an absorbing state is no evidence: an episode's end is no decision, and every local model maps onto
+    such a state with error 0. So it makes no difference whether demonstrations stop at the goal or walk on in it.
+    """
+    absorbs = absorbing_states(mdp)
+    xp = checks.arrays_of(visited, absorbs)
+    return xp.asarray(visited) & ~xp.asarray(absorbs)
+
+
 def uniform_policy(mdp: MDP) -> Float[Array, "S A"]:
     """Every allowed action alike; in NumPy at hand, also under `jit` and `vmap`."""
     allowed = checks.arrays_of(mdp.allowed).asarray(mdp.allowed, mdp.dtype)

@@ -13,6 +13,7 @@ interrupts.watch_while_loading()  # before the imports below, which take a secon
 
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.lpal import LPAL, LPALMethod, LPALSolution, lpal
+from jaxhom.apprenticeship.max_causal_entropy import max_causal_entropy
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
@@ -37,6 +38,7 @@ from jaxhom.models.mdp import MDP
 from jaxhom.models.stacking import stack_models
 from jaxhom.planning.occupancy import feature_expectations, occupancy, policy_value
 from jaxhom.planning.optimal import Plan, optimal_policy
+from jaxhom.planning.soft_optimal import soft_optimal_policy
 from jaxhom.planning.trials import Evaluation, agreement, evaluate_by_sampling, evaluate_exactly
 from jaxhom.similarity.brackets import LocalSimilarity
 from jaxhom.similarity.local_pairs import local_similarity, locally_similar
@@ -80,6 +82,7 @@ __all__ = [
     "local_similarity",
     "locally_similar",
     "lpal",
+    "max_causal_entropy",
     "maximum_entropy",
     "monte_carlo_feature_expectations",
     "nearest_neighbors",
@@ -92,6 +95,7 @@ __all__ = [
     "sample_weights",
     "soft_homomorphism",
     "soft_local_homomorphism",
+    "soft_optimal_policy",
     "stack_models",
     "uniform_elsewhere",
 ]

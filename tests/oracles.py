@@ -62,6 +62,31 @@ def optimal_value(transition, discount, reward):
     return value, action_value
 
 
+def soft_optimal(transition, discount, reward, temperature=1.0, sweeps=20_000):
+    """Soft value iteration, sweep by sweep: policy [S, A], value [S], action values [S, A]; -inf forbids an action."""
+    value = np.zeros(len(transition))
+    for _ in range(sweeps):
+        q = reward + discount * transition @ value
+        best = q.max(axis=1)
+        new = best + temperature * np.log(np.exp((q - best[:, None]) / temperature).sum(axis=1))
+        if np.abs(new - value).max() < 1e-13 * (1 + np.abs(new).max()):
+            break
+        value = new
+    q = reward + discount * transition @ new
+    return np.exp((q - new[:, None]) / temperature), new, q
+
+
+def causal_entropy_objective(transition, discount, initial, features, weights, *, steps=None, expectations=None):
+    """What maximum causal entropy minimises, without penalties.
+
+    The mean of -log pi(a | s) over `steps` [(s, a), ...], or (1 - gamma) (alpha . V - w . expectations).
+    """
+    policy, value, _ = soft_optimal(transition, discount, features @ weights)
+    if steps is not None:
+        return -np.mean([np.log(policy[s, a]) for s, a in steps])
+    return (1 - discount) * (initial @ value - weights @ expectations)
+
+
 def margin(transition, discount, initial, features, expectations, policy):
     """min_i V_i(policy) - Vhat_i, with Vhat = `expectations` [K]."""
     achieved = feature_expectations(transition, discount, initial, features, policy)

@@ -92,6 +92,16 @@ def cases() -> dict[str, Case]:
             reward,
             result=lambda plan: (plan.value, plan.action_value),
         ),
+        "soft_optimal_policy": Case(
+            lambda reward: jaxhom.soft_optimal_policy(mdp, reward, temperature=0.5),
+            reward,
+            result=lambda plan: (plan.policy, plan.value, plan.action_value),
+        ),
+        "max_causal_entropy": Case(
+            lambda vhat: jaxhom.max_causal_entropy(mdp, expectations=vhat, l2=0.1),
+            vhat,
+            result=lambda learned: (learned.policy, learned.objective, learned.weights),
+        ),
         "evaluate_exactly": Case(
             lambda policy: jaxhom.evaluate_exactly(mdp, policy, reward, 5),
             policy,

@@ -78,6 +78,11 @@ STEPS = {
     "choose_generalization": lambda mdp, policy: jaxhom.choose_generalization(
         mdp, DEMONSTRATIONS, {"plain": {}, "walks": {"relation": "random_walk"}, "k-NN": jaxhom.nearest_neighbors}
     ),
+    "soft_optimal_policy": lambda mdp, policy: jaxhom.soft_optimal_policy(mdp, np.asarray(mdp.features)[..., 0]),
+    "max_causal_entropy": lambda mdp, policy: jaxhom.max_causal_entropy(mdp, DEMONSTRATIONS),
+    "max_causal_entropy, expectations": lambda mdp, policy: jaxhom.max_causal_entropy(
+        mdp, expectations=np.full(FEATURES, 3.0)
+    ),
     "lpal": lambda mdp, policy: jaxhom.lpal(mdp, np.full(FEATURES, 3.0), initial_policy=policy),
     "lpal of two": lambda mdp, policy: jaxhom.lpal(mdp, np.array([3.0, 4.0])[:, None] + np.zeros(FEATURES)),
 }

@@ -30,6 +30,7 @@ _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
 # than the hundreds of products of an iteration.
 _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
+_SMALL_ERROR, _MAX_PRODUCTS = 1e-10, 300  # of BiCGSTAB; racetracks take 50 steps
 _latest: dict = {}  # one entry at most
 
 
@@ -64,19 +65,24 @@ class HostModel:
         """E[value(s') | s, a]."""
         return (self.rows @ value).reshape(self.num_states, self.num_actions)
 
-    def chain(self, policy: Float[np.ndarray, "S A"] | Int[np.ndarray, " S"]) -> HostChain:
-        """The chain of a policy, or of the actions that a deterministic one takes."""
-        states = np.arange(self.num_states)
+    def chain(
+        self, policy: Float[np.ndarray, "S A"] | Int[np.ndarray, " S"], *, may_iterate: bool = False
+    ) -> HostChain:
+        """The chain of a policy, or of the actions that a deterministic one takes.
+
+        With `may_iterate` it is solved by products where factors take long and products do it.
+        """
+        states, by_products = np.arange(self.num_states), may_iterate and not self.is_soon_factorised
         if policy.ndim == 1:
-            return HostChain(self.rows[states * self.num_actions + policy], self.discount)
+            return HostChain(self.rows[states * self.num_actions + policy], self.discount, by_products)
         policy = np.asarray(policy, np.float64)
         if not scipy.sparse.issparse(self.rows):
             transition = np.einsum("sa,saz->sz", policy, self.rows.reshape(*policy.shape, -1))
-            return HostChain(transition, self.discount)
+            return HostChain(transition, self.discount, by_products)
         state, action = np.nonzero(policy)
         entries = (policy[state, action], (state, state * self.num_actions + action))
         choice = scipy.sparse.csr_array(entries, shape=(self.num_states, len(states) * self.num_actions))
-        return HostChain(choice @ self.rows, self.discount)
+        return HostChain(choice @ self.rows, self.discount, by_products)
 
     @functools.cached_property
     def bandwidth(self) -> int:
@@ -121,49 +127,90 @@ class HostModel:
 
 
 class HostChain:
-    """One chain P_pi, factorised: solves with I - gamma P_pi and with its transpose."""
+    """One chain P_pi: solves with I - gamma P_pi and with its transpose.
 
-    def __init__(self, transition: Float[np.ndarray, "S S"] | scipy.sparse.csr_array, discount: float) -> None:
-        self._discount = discount
+    By LU; with `by_products` by BiCGSTAB (van der Vorst 1992), and by LU where that does not get on.
+    """
+
+    def __init__(
+        self,
+        transition: Float[np.ndarray, "S S"] | scipy.sparse.csr_array,
+        discount: float,
+        by_products: bool = False,
+    ) -> None:
+        self._discount, self._by_products = discount, by_products
         if not scipy.sparse.issparse(transition):
             self._transition = transition / _or_one(transition.sum(axis=1))[:, None]
-            leaving = self._transition - np.diag(self._transition.diagonal())
-            keeps = (1.0 - discount) + discount * leaving.sum(axis=1)
-            self._factor = scipy.linalg.lu_factor(np.diag(keeps) - discount * leaving)
             return
-        size, pointers, successor = transition.shape[0], transition.indptr, transition.indices
+        state = np.repeat(np.arange(transition.shape[0]), np.diff(transition.indptr))
+        chance = transition.data / _or_one(np.bincount(state, transition.data, transition.shape[0]))[state]
+        entries = (chance, transition.indices, transition.indptr)
+        self._transition = scipy.sparse.csr_array(entries, shape=transition.shape)
+
+    @functools.cached_property
+    def _factor(self):
+        """Of I - gamma P; of its transpose if it is sparse."""
+        transition, discount = self._transition, self._discount
+        if not scipy.sparse.issparse(transition):
+            leaving = transition - np.diag(transition.diagonal())
+            keeps = (1.0 - discount) + discount * leaving.sum(axis=1)
+            return scipy.linalg.lu_factor(np.diag(keeps) - discount * leaving)
+        size, successor, chance = transition.shape[0], transition.indices, transition.data
         states = np.arange(size)
-        state = np.repeat(states, np.diff(pointers))
-        chance = transition.data / _or_one(np.bincount(state, transition.data, size))[state]
-        self._transition = scipy.sparse.csr_array((chance, successor, pointers), shape=transition.shape)
+        state = np.repeat(states, np.diff(transition.indptr))
         leaves = successor != state
         keeps = (1.0 - discount) + discount * np.bincount(state[leaves], chance[leaves], size)
         numbers = np.concatenate([-discount * chance[leaves], keeps])
         row, column = np.append(state[leaves], states), np.append(successor[leaves], states)
         # The transpose, by columns as SuperLU wants it. No pivoting: the diagonal dominates.
         columns = scipy.sparse.csc_array((numbers, (column, row)), shape=transition.shape)
-        self._factor = scipy.sparse.linalg.splu(
+        return scipy.sparse.linalg.splu(
             columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
 
-    def value(self, reward: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
-        """V of rewards r_pi; NaN where rounding leaves more than a thousandth open."""
-        return self._checked(reward, is_flow=False)
+    def value(self, reward: Float[np.ndarray, " S"], error: float = _SMALL_ERROR) -> Float[np.ndarray, " S"]:
+        """V of rewards r_pi; NaN where rounding leaves more than a thousandth open.
+
+        Args:
+          reward: [S].
+          error: share of the values that may be off where products solve.
+        """
+        return self._checked(reward, is_flow=False, error=error)
 
     def state_occupancy(self, initial: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
         """mu of an initial distribution; likewise."""
-        return np.maximum(self._checked(initial, is_flow=True), 0.0)
+        return np.maximum(self.flow(initial), 0.0)
 
-    def _checked(self, right: np.ndarray, is_flow: bool) -> np.ndarray:
-        solution = self._solve(right, is_flow)
-        step = self._transition.T @ solution if is_flow else self._transition @ solution
-        missing = right - solution + self._discount * step
+    def flow(self, source: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
+        """(I - gamma P)^-T of a source that may have either sign; likewise."""
+        return self._checked(source, is_flow=True)
+
+    def _checked(self, right: np.ndarray, is_flow: bool, error: float = _SMALL_ERROR) -> np.ndarray:
+        if self._by_products:
+            solution = self._accepted(right, self._iterate(right, is_flow, error), is_flow)
+            if np.isfinite(solution).all():
+                return solution
+        return self._accepted(right, self._solve(right, is_flow), is_flow)
+
+    def _accepted(self, right: np.ndarray, solution: np.ndarray, is_flow: bool) -> np.ndarray:
+        """The solution, or NaN."""
+        missing = right - solution + self._discount * self._step(solution, is_flow)
         # |(I - gamma P)^-1| is 1 / (1 - gamma) in the norm of sums for flows, and in that of maxima for values.
         norm = (lambda v: np.abs(v).sum()) if is_flow else (lambda v: np.abs(v).max())
         size = max(norm(solution), norm(right))
         if not norm(missing) <= _GOOD_ENOUGH * (1.0 - self._discount) * size + np.finfo(float).tiny:
             return np.full_like(solution, np.nan)
         return solution
+
+    def _step(self, vector: np.ndarray, is_flow: bool) -> np.ndarray:
+        return self._transition.T @ vector if is_flow else self._transition @ vector
+
+    def _iterate(self, right: np.ndarray, is_flow: bool, error: float) -> np.ndarray:
+        operator = scipy.sparse.linalg.LinearOperator(
+            self._transition.shape, lambda x: x - self._discount * self._step(x, is_flow), dtype=np.float64
+        )
+        options = {"rtol": error * (1.0 - self._discount), "maxiter": _MAX_PRODUCTS}
+        return scipy.sparse.linalg.bicgstab(operator, right, **options)[0]
 
     def _solve(self, right: np.ndarray, is_flow: bool) -> np.ndarray:
         if isinstance(self._factor, tuple):

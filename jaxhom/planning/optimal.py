@@ -75,7 +75,7 @@ def optimal_policy(
     Source: Puterman 1994, sections 6.4 to 6.6; the expert of Boularias and Chaib-draa 2010, section VI.
     """
     mdp = as_model(mdp)
-    reward, is_batch = _reward_batch(mdp, reward)
+    reward, is_batch = reward_batch(mdp, reward)
     xp = checks.arrays_of(mdp, reward, initial_value, tolerance)
     initial_value = xp.asarray(np.zeros(mdp.num_states) if initial_value is None else initial_value, mdp.dtype)
     if initial_value.shape == (mdp.num_states,):
@@ -100,7 +100,7 @@ def optimal_policy(
     return jax.tree.map(checks.to_device, plan)
 
 
-def _reward_batch(mdp: MDP, reward) -> tuple[Float[Array, "B S A"], bool]:
+def reward_batch(mdp: MDP, reward) -> tuple[Float[Array, "B S A"], bool]:
     """Brings the accepted shapes of a reward to [B, S, A], -inf where an action is not allowed; checks the values."""
     states, actions = mdp.num_states, mdp.num_actions
     if not checks.is_traced(reward):

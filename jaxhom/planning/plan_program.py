@@ -61,7 +61,7 @@ def plan_in_program(
     tie_tolerance = jnp.maximum(4.0 * residual, jnp.minimum(rounding, little))
     if value.dtype != jnp.float64:
         size = jnp.abs(value).max(axis=0)
-        hidden = _hidden_share(mdp, value.dtype)
+        hidden = hidden_share(mdp, value.dtype)
         residual += hidden * size
         is_solved &= hidden <= _VISIBLE * (1.0 - mdp.discount)
     plan = Plan(
@@ -121,7 +121,7 @@ def _improve_by_solving(
     return value, steps, settled
 
 
-def _hidden_share(mdp: MDP, dtype) -> Float[Array, ""]:
+def hidden_share(mdp: MDP, dtype) -> Float[Array, ""]:
     """The share of the values by which a backup in this type may be off without seeing it.
 
     Rows sum to 1 up to a rounding, and their products with the values are rounded. Discounted sums make that

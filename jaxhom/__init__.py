@@ -26,6 +26,7 @@ from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
 from jaxhom.guarantees.loss_bound import LossBound, loss_bound
+from jaxhom.guarantees.robust_policy import RobustPolicy, robust_policy
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -65,6 +66,7 @@ __all__ = [
     "LossBound",
     "Plan",
     "Racetrack",
+    "RobustPolicy",
     "SimilarityTable",
     "SoftHomomorphism",
     "Status",
@@ -91,6 +93,7 @@ __all__ = [
     "optimal_policy",
     "policy_value",
     "racetrack",
+    "robust_policy",
     "sample_demonstrations",
     "sample_weights",
     "soft_homomorphism",

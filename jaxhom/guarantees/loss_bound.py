@@ -27,7 +27,8 @@ from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, deciding_states
-from jaxhom.status import Record, summary
+from jaxhom.solvers.blas_threads import one_blas_thread
+from jaxhom.status import Record, Status, summary
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -56,7 +57,7 @@ class LossBound(Record):
         but for what it is rounded up by, see `loss_bound`.
       agreed: bool [S], the states S^E in which the expert is known: demonstrated, and something was to be decided.
       weights: [K], as given; None if none were.
-      status: int32 scalar, a `jaxhom.Status`: SOLVED where every feature's optimum was found.
+      status: int32 scalar, a `jaxhom.Status`: SOLVED where every feature's optimum was found, and the policy's values.
     """
 
     bound: Float[Array, "*B"]
@@ -134,12 +135,8 @@ def loss_bound(
     Source: the bound is that of Syed, Bowling and Schapire 2008 for a set of experts; its parts by the performance
     difference lemma of Kakade and Langford 2002.
     """
-    mdp = as_model(mdp)
-    if checks.is_traced(mdp, demonstrations, getattr(policy, "policy", policy), weights, horizon):
-        raise ValueError("loss_bound plans on the host: call it outside jit, vmap and grad")
-    if not mdp.num_features:
-        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
-    with checks.at_once():
+    mdp = concrete_problem("loss_bound", mdp, demonstrations, getattr(policy, "policy", policy), weights, horizon)
+    with checks.at_once(), one_blas_thread():
         policy = np.asarray(check_policy(mdp, policy))
         checks.require_shape("policy", policy, "(B, S, A) with B >= 1", len(policy) > 0)
         weights = None if weights is None else _checked_weights(mdp, weights)
@@ -149,6 +146,16 @@ def loss_bound(
         return (
             lanes[0] if policy.ndim == 2 else jax.tree.map(lambda *leaves: checks.to_device(np.stack(leaves)), *lanes)
         )
+
+
+def concrete_problem(name: str, mdp: Any, *given: Any) -> MDP:
+    """The model, or `ValueError` if it has no features, or if it or what else is given to the function is traced."""
+    mdp = as_model(mdp)
+    if checks.is_traced(mdp, *given):
+        raise ValueError(f"{name} plans on the host: call it outside jit, vmap and grad")
+    if not mdp.num_features:
+        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+    return mdp
 
 
 class Agreeing:
@@ -198,7 +205,7 @@ class Agreeing:
             **{name: None if field is None else checks.to_device(field) for name, field in fields.items()},
             worst=checks.to_device(worst, np.int32),
             agreed=checks.to_device(self.agreed),
-            status=checks.to_device(self.status, np.int32),
+            status=checks.to_device(self.status if self.status != Status.SOLVED else own.status, np.int32),
         )
 
     def _plan(self, choices: Choices) -> Found:

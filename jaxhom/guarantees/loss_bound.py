@@ -189,9 +189,7 @@ class Agreeing:
         bound, share = weighted[worst], np.eye(len(gaps))[worst]
         if weights is not None:
             bound, share = _sum_up(weighted), weights
-        parts = np.zeros(len(policy))
-        for k in np.flatnonzero(share):
-            parts += share[k] * self._contributions(choices, own, int(k))
+        parts = self._contributions(choices, own, share)
         parts[self._is_as_the_expert(policy)] = 0.0
         fields = {
             "bound": _rounded_up(bound, dtype),
@@ -211,10 +209,10 @@ class Agreeing:
     def _plan(self, choices: Choices) -> Found:
         return all_time.best(choices) if self._horizon is None else first_steps.best(choices, self._horizon)
 
-    def _contributions(self, policy: Choices, own: Found, k: int) -> Float[np.ndarray, " S"]:
+    def _contributions(self, policy: Choices, own: Found, share: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
         if self._horizon is None:
-            return all_time.contributions(self._choices, self._best, own, k)
-        return first_steps.contributions(self._choices, policy, k, self._horizon)
+            return all_time.contributions(self._choices, self._best, own, share)
+        return first_steps.contributions(self._choices, policy, share, self._horizon)
 
     def _is_as_the_expert(self, policy: Float[np.ndarray, "S A"]) -> Bool[np.ndarray, " S"]:
         """Where nothing can be lost but by rounding."""

@@ -13,6 +13,7 @@ import small_models
 
 import jaxhom
 from jaxhom import MDP, Demonstrations, Status, loss_bound
+from jaxhom.guarantees import first_steps
 from jaxhom.planning import policy_iteration
 
 SEEDS, CASES = 20, 50  # of random models: seeds times cases of each
@@ -196,6 +197,15 @@ def test_the_first_steps_by_enumeration(rng):
     assert len(worth) == 4**3
     loss = loss_bound(given.mdp, given.demonstrations, given.policy, horizon=3)
     assert loss.optima[0] == pytest.approx(max(worth), abs=1e-9)
+
+
+def test_features_one_at_a_time(rng, monkeypatch):
+    """As where the values of all times would not fit."""
+    given, weights = problem(rng), rng.exponential(size=3)
+    together = loss_bound(given.mdp, given.demonstrations, given.policy, weights=weights, horizon=5)
+    monkeypatch.setattr(first_steps, "_NUMBERS_AT_A_TIME", 1)
+    alone = loss_bound(given.mdp, given.demonstrations, given.policy, weights=weights, horizon=5)
+    np.testing.assert_allclose(alone.contributions, together.contributions, rtol=0, atol=1e-12)
 
 
 def test_many_steps_are_all_time(rng):

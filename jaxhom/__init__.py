@@ -26,6 +26,8 @@ from jaxhom.generalization.regression import occupancy_regression
 from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
+from jaxhom.guarantees.loss_bound import LossBound, loss_bound
+from jaxhom.guarantees.robust_policy import RobustPolicy, robust_policy
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -63,8 +65,10 @@ __all__ = [
     "LPALSolution",
     "Learned",
     "LocalSimilarity",
+    "LossBound",
     "Plan",
     "Racetrack",
+    "RobustPolicy",
     "SimilarityTable",
     "SoftHomomorphism",
     "Status",
@@ -81,6 +85,7 @@ __all__ = [
     "homomorphism_map",
     "local_similarity",
     "locally_similar",
+    "loss_bound",
     "lpal",
     "max_causal_entropy",
     "maximum_entropy",
@@ -91,6 +96,7 @@ __all__ = [
     "optimal_policy",
     "policy_value",
     "racetrack",
+    "robust_policy",
     "sample_demonstrations",
     "sample_weights",
     "soft_homomorphism",

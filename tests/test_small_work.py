@@ -84,6 +84,13 @@ STEPS = {
         mdp, expectations=np.full(FEATURES, 3.0)
     ),
     "lpal": lambda mdp, policy: jaxhom.lpal(mdp, np.full(FEATURES, 3.0), initial_policy=policy),
+    "loss_bound": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, policy),
+    "loss_bound, weights": lambda mdp, policy: jaxhom.loss_bound(
+        mdp, DEMONSTRATIONS, policy, weights=np.ones(FEATURES)
+    ),
+    "loss_bound, a batch": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, np.stack([policy, policy])),
+    "loss_bound, first steps": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, policy, horizon=7),
+    "robust_policy": lambda mdp, policy: jaxhom.robust_policy(mdp, DEMONSTRATIONS),
     "lpal of two": lambda mdp, policy: jaxhom.lpal(mdp, np.array([3.0, 4.0])[:, None] + np.zeros(FEATURES)),
 }
 MODELS = {

@@ -11,8 +11,11 @@ from jaxhom import interrupts
 
 interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
 
+from jaxhom.apprenticeship.inverse_lp import inverse_lp
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.lpal import LPAL, LPALMethod, LPALSolution, lpal
+from jaxhom.apprenticeship.mwal import mwal
+from jaxhom.apprenticeship.projection import projection
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
@@ -77,16 +80,19 @@ __all__ = [
     "gridworld",
     "homomorphism_error",
     "homomorphism_map",
+    "inverse_lp",
     "local_similarity",
     "locally_similar",
     "lpal",
     "maximum_entropy",
     "monte_carlo_feature_expectations",
+    "mwal",
     "nearest_neighbors",
     "occupancy",
     "occupancy_regression",
     "optimal_policy",
     "policy_value",
+    "projection",
     "racetrack",
     "sample_demonstrations",
     "sample_weights",

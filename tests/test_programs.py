@@ -167,6 +167,9 @@ def cases() -> dict[str, Case]:
         ),
         "lpal": Case(lambda vhat: jaxhom.lpal(mdp, vhat), vhat, **margins),
         "LPAL.solve": Case(jaxhom.LPAL(mdp).solve, vhat, **margins),
+        "projection": Case(lambda vhat: jaxhom.projection(mdp, vhat), vhat),
+        "mwal": Case(lambda vhat: jaxhom.mwal(mdp, vhat), vhat),
+        "inverse_lp": Case(lambda policy: jaxhom.inverse_lp(mdp, policy), policy),
         "SimilarityTable": Case(
             lambda discount: jaxhom.SimilarityTable(mdp.replace(probability=mdp.probability * (discount / discount))),
             half,

@@ -11,9 +11,12 @@ from jaxhom import interrupts
 
 interrupts.watch_while_loading()  # before the imports below, which take a second; in `python -m jaxhom` alone
 
+from jaxhom.apprenticeship.inverse_lp import inverse_lp
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.lpal import LPAL, LPALMethod, LPALSolution, lpal
 from jaxhom.apprenticeship.max_causal_entropy import max_causal_entropy
+from jaxhom.apprenticeship.mwal import mwal
+from jaxhom.apprenticeship.projection import projection
 from jaxhom.domains.gridworld import Gridworld, gridworld, sample_weights
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
@@ -83,6 +86,7 @@ __all__ = [
     "gridworld",
     "homomorphism_error",
     "homomorphism_map",
+    "inverse_lp",
     "local_similarity",
     "locally_similar",
     "loss_bound",
@@ -90,11 +94,13 @@ __all__ = [
     "max_causal_entropy",
     "maximum_entropy",
     "monte_carlo_feature_expectations",
+    "mwal",
     "nearest_neighbors",
     "occupancy",
     "occupancy_regression",
     "optimal_policy",
     "policy_value",
+    "projection",
     "racetrack",
     "robust_policy",
     "sample_demonstrations",

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 from scipy import sparse
-from scipy.optimize import linprog
+from scipy.optimize import linprog, nnls
 
 # ------------------------------------------------------------------ occupancy, values, planning
 
@@ -557,6 +557,79 @@ def _solve_lp(cost, A_ub=None, b_ub=None, A_eq=None, b_eq=None, bounds=None):
     if not result.success:
         raise RuntimeError(f"linprog: {result.message}")
     return result
+
+
+# ---------------------------------------------------------------------------- other learners
+
+
+def all_expectations(transition, discount, initial, features):
+    """Feature expectations [A^S, K] of all deterministic policies; those of all policies are their convex hull."""
+    num_states, num_actions, _ = features.shape
+    policies = itertools.product(range(num_actions), repeat=num_states)
+    rows = [
+        feature_expectations(transition, discount, initial, features, np.eye(num_actions)[list(actions)])
+        for actions in policies
+    ]
+    return np.array(rows)
+
+
+def least_distance(points, target):
+    """Distance in the 2-norm from `target` [K] to the convex hull of `points` [M, K].
+
+    Non-negative least squares of [(p_j - target) / c, 1] . u against [0, 1]: with u = s q, q in the simplex, the best s
+    leaves d^2 / (1 + d^2), d = |q . (p - target)| / c, so that q is nearest.
+    """
+    away = points - target
+    scale = max(np.median(np.linalg.norm(away, axis=1)), 1e-300)
+    shares, _ = nnls(np.vstack([away.T / scale, np.ones(len(away))]), np.append(np.zeros(len(target)), 1.0))
+    return np.linalg.norm(shares / shares.sum() @ away)
+
+
+def inverse_lp_from_policy(transition, discount, actions, rewards, l1, largest):
+    """Ng and Russell 2000, section 3.2 (and 4), for a deterministic policy: (objective, weights [K]).
+
+    `actions` int [S]; `rewards` [S, K], the reward of every state that weight k adds. Maximise over w, t [S] and u [K]
+    sum_s t(s) - l1 |w|_1 with t(s) <= discount (P_pi(s) - P_a(s)) (I - discount P_pi)^-1 R, a != pi(s), all of these
+    not negative, and |w_k| <= largest. (The paper's objective has no discount, and so an l1 without it.)
+    """
+    num_states, num_actions, _ = transition.shape
+    num_weights = rewards.shape[1]
+    own = transition[np.arange(num_states), actions]
+    inverse = np.linalg.inv(np.eye(num_states) - discount * own)
+    below, right = [], []
+    for s in range(num_states):
+        for a in range(num_actions):
+            if a != actions[s]:
+                gain = discount * (own[s] - transition[s, a]) @ inverse @ rewards
+                below.append(np.concatenate([-gain, np.eye(num_states)[s], np.zeros(num_weights)]))
+                below.append(np.concatenate([-gain, np.zeros(num_states), np.zeros(num_weights)]))
+                right += [0.0, 0.0]
+    for k in range(num_weights):
+        for sign in (1.0, -1.0):
+            below.append(np.concatenate([sign * np.eye(num_weights)[k], np.zeros(num_states), -np.eye(num_weights)[k]]))
+            right.append(0.0)
+    result = _solve_lp(
+        cost=np.concatenate([np.zeros(num_weights), -np.ones(num_states), np.full(num_weights, l1)]),
+        A_ub=np.array(below),
+        b_ub=np.array(right),
+        bounds=[(-largest, largest)] * num_weights + [(None, None)] * num_states + [(0, None)] * num_weights,
+    )
+    return -result.fun, result.x[:num_weights]
+
+
+def inverse_lp_from_expectations(expert, met, largest):
+    """Ng and Russell 2000, section 5: max sum_i p(w . (expert - met_i)), p(x) = min(x, 2 x), |w_k| <= largest.
+
+    `expert` [K], `met` [M, K]; x_i = y_i - z_i with y, z >= 0 is worth y_i - 2 z_i.
+    """
+    count, num_weights = met.shape
+    result = _solve_lp(
+        cost=np.concatenate([np.zeros(num_weights), -np.ones(count), np.full(count, 2.0)]),
+        A_eq=np.hstack([expert - met, -np.eye(count), np.eye(count)]),
+        b_eq=np.zeros(count),
+        bounds=[(-largest, largest)] * num_weights + [(0, None)] * (2 * count),
+    )
+    return -result.fun
 
 
 # --------------------------------------------------------------------------------- evaluation

@@ -181,6 +181,9 @@ def cases() -> dict[str, Case]:
         "robust_policy": Case(
             lambda scale: jaxhom.robust_policy(mdp.replace(features=scale * mdp.features), walks).policy, one
         ),
+        "projection": Case(lambda vhat: jaxhom.projection(mdp, vhat), vhat),
+        "mwal": Case(lambda vhat: jaxhom.mwal(mdp, vhat), vhat),
+        "inverse_lp": Case(lambda policy: jaxhom.inverse_lp(mdp, policy), policy),
         "SimilarityTable": Case(
             lambda discount: jaxhom.SimilarityTable(mdp.replace(probability=mdp.probability * (discount / discount))),
             half,

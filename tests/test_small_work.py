@@ -92,6 +92,10 @@ STEPS = {
     "loss_bound, first steps": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, policy, horizon=7),
     "robust_policy": lambda mdp, policy: jaxhom.robust_policy(mdp, DEMONSTRATIONS),
     "lpal of two": lambda mdp, policy: jaxhom.lpal(mdp, np.array([3.0, 4.0])[:, None] + np.zeros(FEATURES)),
+    "projection": lambda mdp, policy: jaxhom.projection(mdp, np.full(FEATURES, 3.0)),
+    "projection, margin": lambda mdp, policy: jaxhom.projection(mdp, np.full((2, FEATURES), 4.0), method="max_margin"),
+    "mwal": lambda mdp, policy: jaxhom.mwal(mdp, np.full(FEATURES, 3.0), max_iterations=20),
+    "inverse_lp": lambda mdp, policy: jaxhom.inverse_lp(mdp, np.asarray(mdp.allowed).argmax(axis=1)),
 }
 MODELS = {
     "sparse": {},

@@ -60,14 +60,30 @@ class ExactSides:
 
         `guess`: of the occupancy.
         """
-        if guess is None and not self._by_host_alone:
-            guess = np.asarray(occupancy(self.mdp, policy), np.float64).sum(axis=1)
         mu, margin = None, np.inf
-        for exact in self._variants:
-            found, expected, error = exact.expectations(policy.astype(np.float64), guess, tolerance)
-            mu, guess = found if mu is None else mu, found
+        for found, expected, error in self._evaluated(policy, tolerance, guess):
+            mu = found if mu is None else mu
             margin = min(margin, float(self._least(expected[None], error[None], expectations).min()))
         return mu, margin
+
+    def expected(
+        self, policy: Float[np.ndarray, "S A"], tolerance: float
+    ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+        """What a policy's feature expectations are at least and at most; rows sum to exactly 1."""
+        low, high = np.inf, -np.inf
+        for _, expected, error in self._evaluated(policy, tolerance, None):
+            totals = self._masses[:, None] * expected
+            error = error + 2.0 * _EPS * np.abs(expected)
+            low, high = np.minimum(low, totals.min(axis=0) - error), np.maximum(high, totals.max(axis=0) + error)
+        return low, high
+
+    def _evaluated(self, policy, tolerance, guess):
+        """The states' occupancy, V [K] and its error [K] of every variant of the model."""
+        if guess is None and not self._by_host_alone:
+            guess = np.asarray(occupancy(self.mdp, policy), np.float64).sum(axis=1)
+        for exact in self._variants:
+            guess, expected, error = exact.expectations(policy.astype(np.float64), guess, tolerance)
+            yield guess, expected, error
 
     def _least(self, expected, error, expectations):
         """V_k - Vhat_k at least, [B, K], of V [B, K] that are known up to an error."""
@@ -83,7 +99,16 @@ class ExactSides:
     ) -> tuple[float, Int[np.ndarray, " S"]]:
         """No policy's margin is larger; and the best actions for the weights. `value`: a guess of their values."""
         weights = weights.astype(np.float64)
-        weights /= weights.sum()
+        return self.advantage(weights / weights.sum(), expectations, value, tolerance)
+
+    def advantage(
+        self,
+        weights: Float[np.ndarray, " K"],
+        expectations: Float[np.ndarray, " K"],
+        value: Float[np.ndarray, " S"] | None,
+        tolerance: float,
+    ) -> tuple[float, Int[np.ndarray, " S"]]:
+        """No policy's w . (V - Vhat) is larger, whatever the signs of w; and the best actions for w."""
         best, actions = -np.inf, None
         for exact in self._variants:
             bound, value, actions = exact.plan(weights, value, actions, tolerance)

@@ -152,7 +152,7 @@ class Exact:
         """The best policy for the reward w . phi.
 
         Args:
-          weights: [K], non-negative.
+          weights: [K].
           value: [S], a guess of the optimal values, or None. actions: [S], of the optimal actions, or None.
           tolerance: an error that does not matter.
 
@@ -197,7 +197,7 @@ class Exact:
         """What guesses of the optimal values prove, without linear solves.
 
         Args:
-          weights: [B, K], non-negative.
+          weights: [B, K].
           value: [B, S]; what no policy can be worth is cut off.
 
         Returns:
@@ -211,7 +211,7 @@ class Exact:
     def _reward(self, weights):
         """w . phi [B, S, A], or [B, S, 1] if it is the same for all actions, and the largest of each [B]."""
         reward = (weights @ self.features.T).reshape(len(weights), len(self.initial), -1)
-        size = np.abs(reward).max(axis=(1, 2)) + (weights.shape[1] + 2) * _EPS * (weights @ self.size)
+        size = np.abs(reward).max(axis=(1, 2)) + (weights.shape[1] + 2) * _EPS * (np.abs(weights) @ self.size)
         return np.broadcast_to(reward, (len(weights), *self.allowed.shape)), size
 
     def _bound(self, reward, size, value, actions, num_features):

@@ -23,11 +23,12 @@ class Learned(Record):
     Attributes:
       policy: [S, A], rows sum to 1: the policy of the learner's theory, which may be random.
       greedy_policy: [S, A], one-hot: optimal for `weights`.
-      weights: [K], of the features as the model has them; the reward is features @ weights.
-      expectations: [K], feature expectations of `policy`.
+      weights: [K], of the features as the model has them; the reward is features @ weights. Where `inverse_lp` is given
+        a model without features, [S], the reward of every state.
+      expectations: [K], feature expectations of `policy`; [S], its occupancy of the states, where `weights` are [S].
       objective: scalar, what the learner makes small or large, at what is returned.
-      bound: scalar, what no policy can go beyond, certified: the objective's distance to it is the certificate; None
-        where the learner has none.
+      bound: scalar, what no policy (of `inverse_lp`: no weights) can go beyond, certified: the objective's distance to
+        it is the certificate; None where the learner has none.
       gradient_norm: scalar, the largest entry of the gradient that is left; None where nothing is descended.
       iterations: int32 scalar.
       status: int32 scalar, a `jaxhom.Status`.

@@ -1,0 +1,173 @@
+"""What learners that play against best responses share: the doors, the responses, and the certified end.
+
+`projection` and `mwal` seek a mixture of policies, one best response after the other, on the host in float64 (`exact`).
+The mixture's occupancy is the same mixture of the policies' occupancies, and eq. (5) gives the one stationary policy
+that has it. What is returned is evaluated anew, from the policy and the weights as they are in the model's type.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from jaxhom import checks
+from jaxhom.apprenticeship.arguments import check_features, checked_expectations
+from jaxhom.apprenticeship.certificate import ExactSides
+from jaxhom.apprenticeship.exact import exact_rows
+from jaxhom.apprenticeship.learned import Learned
+from jaxhom.apprenticeship.policy_pool import PolicyPool
+from jaxhom.apprenticeship.presolve import Reach
+from jaxhom.models.inputs import as_model
+from jaxhom.models.mdp import MDP
+from jaxhom.planning import policy_iteration
+from jaxhom.planning.occupancy import policy_from_occupancy
+from jaxhom.status import Status
+
+if TYPE_CHECKING:
+    from jaxtyping import ArrayLike, Float, Int
+
+_DIGITS = 1e-3  # share of the tolerance by which responses may miss the best, and evaluations the truth
+_NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact, and many rare states add up
+
+
+class Responder:
+    """Best responses to weights of any sign on one model; a policy that comes up again is not evaluated again.
+
+    Args:
+      sides: the model.
+      tolerance: what the caller is after.
+
+    Attributes:
+      pool: the policies met.
+    """
+
+    def __init__(self, sides: ExactSides, tolerance: float):
+        self._exact, self._error = sides.exact, _DIGITS * tolerance
+        self.pool, self._numbers = PolicyPool(sides.mdp), dict[bytes, int]()
+        self._value = np.zeros(sides.mdp.num_states)
+
+    def respond(self, weights: Float[np.ndarray, " K"]) -> tuple[float, int]:
+        """What no policy's w . V is above, and the number of the best policy in the pool."""
+        most, self._value, actions = self._exact.plan(weights, self._guess(weights), None, self._error)
+        key = actions.tobytes()
+        if key not in self._numbers:
+            policy = np.eye(self._exact.allowed.shape[1])[actions]
+            guess = self._occupancy_of(actions) if self._exact.is_direct else None
+            mu, expected, _ = self._exact.expectations(policy, guess, self._error)
+            self._numbers[key] = self.pool.add(mu, actions, expected)
+        return most, self._numbers[key]
+
+    def add(self, policy: Float[np.ndarray, "S A"]) -> int:
+        """Takes a policy that may be random."""
+        policy = exact_rows(policy, np.float64)
+        mu, expected, _ = self._exact.expectations(policy, None, self._error)
+        return self.pool.add(mu, policy, expected)
+
+    def _guess(self, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
+        """Values of the best policy for the weights: where LU is quick, with few factorisations, from the last ones."""
+        exact = self._exact
+        if not exact.is_direct:
+            return self._value
+        reward = (exact.features @ weights).reshape(len(self._value), -1)
+        reward = np.where(exact.allowed, reward, -np.inf)
+        start = (reward + exact.discount * exact.model.expected_next_value(self._value)).argmax(axis=1)
+        found = policy_iteration.iterate(exact.model, reward, start, float(np.finfo(float).eps))
+        return self._value if found is None else found.value
+
+    def _occupancy_of(self, actions: Int[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
+        return self._exact.model.chain(actions).state_occupancy(self._exact.initial)
+
+
+class Outcome:
+    """What a lane returns, evaluated: the policy of a mixture, and what its weights prove.
+
+    Args:
+      sides: the model.
+      x: [S, A], the mixture's occupancy.
+      weights: [K], as the learner has them.
+      expectations: [K], as the caller gave them. tolerance: of the lane.
+
+    Attributes:
+      policy: [S, A], in the model's type, rows sum to exactly 1.
+      greedy_policy: [S, A], the best actions for the weights.
+      weights: [K], in the model's type.
+      low, high: [K], what the policy's feature expectations are at least and at most.
+      advantage: scalar, no policy's weights . (V - expectations) is larger.
+    """
+
+    def __init__(self, sides: ExactSides, x, weights, expectations, tolerance: float):
+        dtype, error = np.dtype(sides.mdp.dtype), _DIGITS * tolerance
+        self.weights = weights.astype(dtype)
+        self.advantage, actions = sides.advantage(self.weights.astype(np.float64), expectations, None, error)
+        best = np.eye(x.shape[1])[actions]
+        self.greedy_policy = best.astype(dtype)
+        self.policy = exact_rows(policy_from_occupancy(sides.mdp, x, best, _NO_OCCUPANCY), dtype)
+        self.low, self.high = sides.expected(self.policy, error)
+
+    def learned(
+        self, objective: np.ndarray, bound: np.ndarray, iterations: int, status: Status, is_closed: bool
+    ) -> Learned:
+        """The record of the lane. `status`: how the rounds ended; `is_closed`: whether the certificate agrees."""
+        dtype = self.policy.dtype
+        stopped = Status.STALLED if status == Status.SOLVED else status
+        return Learned(
+            policy=self.policy,
+            greedy_policy=self.greedy_policy,
+            weights=self.weights,
+            expectations=(0.5 * (self.low + self.high)).astype(dtype),
+            objective=objective,
+            bound=bound,
+            iterations=np.int32(iterations),
+            status=np.int32(Status.SOLVED if is_closed else stopped),
+        )
+
+
+def solve_lanes(
+    name: str,
+    mdp: MDP,
+    expectations: Float[ArrayLike, "*B K"],
+    tolerance: float | Float[ArrayLike, " B"] | None,
+    default_tolerance: Callable[[Reach, Float[np.ndarray, "B K"]], Float[np.ndarray, "*B"] | float],
+    solve: Callable[[ExactSides, Reach, Float[np.ndarray, " K"], float], Learned],
+) -> Learned:
+    """Checks what a caller of `name` gave, solves lane by lane, and stacks what comes out."""
+    mdp = as_model(mdp)
+    if checks.is_traced(mdp, expectations, tolerance):
+        raise ValueError(
+            f"{name} plans on the host: call it outside jit, vmap and grad, or use lpal there, which works inside"
+        )
+    require_features(mdp)
+    check_features(mdp)
+    expectations = checked_expectations(mdp, expectations)
+    batch = np.atleast_2d(expectations).astype(np.float64)
+    sides, reach = ExactSides(mdp), Reach.of(mdp)
+    if tolerance is None:
+        tolerance = default_tolerance(reach, batch)
+    else:
+        checks.require_positive("tolerance", tolerance)
+        shapes = {(), batch.shape[:1]} if expectations.ndim == 2 else {()}
+        checks.require_shape("tolerance", tolerance, " or ".join(map(str, shapes)), np.shape(tolerance) in shapes)
+    tolerance = np.broadcast_to(np.asarray(tolerance, np.float64), len(batch))
+    lanes = [solve(sides, reach, batch[k], float(tolerance[k])) for k in range(len(batch))]
+    learned = jax.tree.map(lambda *leaves: np.stack(leaves), *lanes) if expectations.ndim == 2 else lanes[0]
+    return jax.tree.map(checks.to_device, learned)
+
+
+def require_features(mdp: MDP) -> None:
+    """Raises unless the model has features."""
+    if not mdp.num_features:
+        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+
+
+def goal_of(mdp: MDP, tolerance: float) -> float:
+    """The gap at which rounds may end: what is left of the tolerance is for what the model's type hides."""
+    return (0.9 if np.dtype(mdp.dtype) == np.float64 else 0.5) * tolerance
+
+
+def mixture(pool: PolicyPool, shares: Float[np.ndarray, " M"]) -> Float[np.ndarray, "S A"]:
+    """The occupancy of the pool's policies, mixed."""
+    (numbers,) = np.nonzero(shares)
+    return pool.mixture(numbers.tolist(), shares[numbers].tolist())

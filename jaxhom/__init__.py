@@ -25,6 +25,7 @@ from jaxhom.generalization.regression import occupancy_regression
 from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
+from jaxhom.guarantees.loss_bound import LossBound, loss_bound
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -61,6 +62,7 @@ __all__ = [
     "LPALSolution",
     "Learned",
     "LocalSimilarity",
+    "LossBound",
     "Plan",
     "Racetrack",
     "SimilarityTable",
@@ -79,6 +81,7 @@ __all__ = [
     "homomorphism_map",
     "local_similarity",
     "locally_similar",
+    "loss_bound",
     "lpal",
     "maximum_entropy",
     "monte_carlo_feature_expectations",

@@ -79,6 +79,12 @@ STEPS = {
         mdp, DEMONSTRATIONS, {"plain": {}, "walks": {"relation": "random_walk"}, "k-NN": jaxhom.nearest_neighbors}
     ),
     "lpal": lambda mdp, policy: jaxhom.lpal(mdp, np.full(FEATURES, 3.0), initial_policy=policy),
+    "loss_bound": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, policy),
+    "loss_bound, weights": lambda mdp, policy: jaxhom.loss_bound(
+        mdp, DEMONSTRATIONS, policy, weights=np.ones(FEATURES)
+    ),
+    "loss_bound, a batch": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, np.stack([policy, policy])),
+    "loss_bound, first steps": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, policy, horizon=7),
     "lpal of two": lambda mdp, policy: jaxhom.lpal(mdp, np.array([3.0, 4.0])[:, None] + np.zeros(FEATURES)),
 }
 MODELS = {

@@ -11,6 +11,7 @@ the chance to leave s: nothing cancels, so float32 tables give right values at a
 
 from __future__ import annotations
 
+import copy
 import functools
 import weakref
 from typing import TYPE_CHECKING
@@ -59,6 +60,13 @@ class HostModel:
         probability = np.asarray(mdp.probability, np.float64).reshape(pairs, -1)
         probability = probability / _or_one(probability.sum(axis=1))[:, None]
         self.rows = mdp.dynamics.host_matrix(probability.reshape(mdp.probability.shape))
+
+    def with_rows(self, rows: Float[np.ndarray, "S*A S"] | scipy.sparse.csr_array) -> HostModel:
+        """The model with other transitions, as `rows` has them; what is not allowed any more stays with the caller."""
+        other = copy.copy(self)
+        other.__dict__.pop("bandwidth", None)
+        other.rows = rows
+        return other
 
     def expected_next_value(self, value: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S A"]:
         """E[value(s') | s, a]."""
@@ -146,8 +154,8 @@ class HostChain:
             columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
 
-    def value(self, reward: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
-        """V of rewards r_pi; NaN where rounding leaves more than a thousandth open."""
+    def value(self, reward: Float[np.ndarray, "S *K"]) -> Float[np.ndarray, "S *K"]:
+        """V of rewards r_pi, one or several; NaN where rounding leaves more than a thousandth (of the largest) open."""
         return self._checked(reward, is_flow=False)
 
     def state_occupancy(self, initial: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:

@@ -26,6 +26,7 @@ from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
 from jaxhom.guarantees.loss_bound import LossBound, loss_bound
+from jaxhom.guarantees.queries import Queries, query_states
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -64,6 +65,7 @@ __all__ = [
     "LocalSimilarity",
     "LossBound",
     "Plan",
+    "Queries",
     "Racetrack",
     "SimilarityTable",
     "SoftHomomorphism",
@@ -90,6 +92,7 @@ __all__ = [
     "occupancy_regression",
     "optimal_policy",
     "policy_value",
+    "query_states",
     "racetrack",
     "sample_demonstrations",
     "sample_weights",

@@ -97,7 +97,8 @@ class Demonstrations(Record):
     def with_answers(self, states: Int[ArrayLike, " N"], actions: Int[ArrayLike, " N"]) -> Demonstrations:
         """The demonstrations, and what the expert said to do in single states.
 
-        Works under `jit` and `vmap`, with states and actions traced.
+        Works under `jit` and `vmap`, with states and actions traced. There a state below 0 is no answer, and its step
+        is masked: `query_states` gives -1 where nothing is left to ask.
 
         An answer is a trajectory of one step that is marked by `is_answer`. `empirical_policy`, and with it all that
         generalizes, counts it beside the steps that are there. The Monte Carlo mean leaves it out, because its time is

@@ -67,11 +67,12 @@ def with_single_steps(demonstrations: Any, states: Any, actions: Any) -> dict[st
         if not checks.is_traced(array):
             given[name] = checks.require_integers(name, np.asarray(array, None if count else int), 2**31 - 1)
     xp = checks.arrays_of(demonstrations, given)
-    blank = np.zeros((count, demonstrations.horizon - 1), np.int32)
-    first = np.repeat(np.arange(demonstrations.horizon)[None] == 0, count, axis=0)
+    is_given = xp.asarray(given["states"]) >= 0
+    is_first = np.arange(demonstrations.horizon) == 0
+    mask = is_given[:, None] & is_first
     rows = {
-        **{name: xp.concatenate([xp.asarray(array, np.int32)[:, None], blank], 1) for name, array in given.items()},
-        "mask": first,
+        **{name: xp.where(mask, xp.asarray(array, np.int32)[:, None], 0) for name, array in given.items()},
+        "mask": mask,
         "terminated": np.zeros(count, bool),
         "final_states": np.full(count, -1, np.int32),
         "is_answer": np.ones(count, bool),

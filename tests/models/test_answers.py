@@ -89,6 +89,11 @@ def test_inside_programs():
     for lane in range(2):
         plain = empirical_policy(case.mdp, shown.with_answers(states[lane], actions[lane]))[1]
         np.testing.assert_allclose(policies[lane], plain)
+    skipped = jax.jit(Demonstrations.with_answers)(shown, jnp.array([-1, 4]), jnp.array([2, 1]))
+    for found, expected in zip(
+        empirical_policy(case.mdp, skipped), empirical_policy(case.mdp, shown.with_answers([4], [1])), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_pickles_files_and_parts(tmp_path):

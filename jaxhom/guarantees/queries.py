@@ -2,7 +2,7 @@
 
 A demonstration goes where the expert goes, and mostly over what is known already. An answer about one state costs one
 step and may lie where the learned policy is led by a guess. States are ranked by how often that policy meets them,
-mu(s) in discounted time, by how unsure it is there, or by what they add to the bound on what can be lost (`loss_bound`).
+mu(s) in discounted time, by how unsure it is there, or by what they add to a bound on what is lost (`loss_bound`).
 
 What an answer can change at most is known before it is given. Let the policy do a in s, and what it did elsewhere. With
 h(s') the discounted number of visits to s from s', and d = T(s, a, .) - P_pi(s, .), the new chain is P_pi + e_s d, and

@@ -31,6 +31,7 @@ from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
 from jaxhom.guarantees.loss_bound import LossBound, loss_bound
 from jaxhom.guarantees.robust_policy import RobustPolicy, robust_policy
+from jaxhom.guarantees.queries import Queries, query_states
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -70,6 +71,7 @@ __all__ = [
     "LocalSimilarity",
     "LossBound",
     "Plan",
+    "Queries",
     "Racetrack",
     "RobustPolicy",
     "SimilarityTable",
@@ -101,6 +103,7 @@ __all__ = [
     "optimal_policy",
     "policy_value",
     "projection",
+    "query_states",
     "racetrack",
     "robust_policy",
     "sample_demonstrations",

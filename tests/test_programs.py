@@ -175,6 +175,11 @@ def cases() -> dict[str, Case]:
             by_features(lambda mdp: jaxhom.occupancy_regression(mdp, walks, grid.coordinates).policy),
             one,
         ),
+        "query_states": Case(
+            lambda policy: jaxhom.query_states(mdp, walks, policy, 3),
+            policy,
+            result=lambda queries: (queries.states.astype(float), queries.scores, queries.changes),
+        ),
         "lpal": Case(lambda vhat: jaxhom.lpal(mdp, vhat), vhat, **margins),
         "LPAL.solve": Case(jaxhom.LPAL(mdp).solve, vhat, **margins),
         "loss_bound": Case(lambda policy: jaxhom.loss_bound(mdp, walks, policy).bound, policy),

@@ -83,6 +83,12 @@ STEPS = {
     "max_causal_entropy, expectations": lambda mdp, policy: jaxhom.max_causal_entropy(
         mdp, expectations=np.full(FEATURES, 3.0)
     ),
+    "query_states": lambda mdp, policy: jaxhom.query_states(mdp, DEMONSTRATIONS, policy, 4),
+    "query_states by visits": lambda mdp, policy: jaxhom.query_states(
+        mdp, DEMONSTRATIONS, policy, 4, criterion="visits"
+    ),
+    "query_states by bound": lambda mdp, policy: jaxhom.query_states(mdp, DEMONSTRATIONS, policy, 4, criterion="bound"),
+    "with_answers": lambda mdp, policy: DEMONSTRATIONS.with_answers([1, 1], [0, 2]).states,
     "lpal": lambda mdp, policy: jaxhom.lpal(mdp, np.full(FEATURES, 3.0), initial_policy=policy),
     "loss_bound": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, policy),
     "loss_bound, weights": lambda mdp, policy: jaxhom.loss_bound(

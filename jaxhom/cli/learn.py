@@ -12,12 +12,17 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jaxhom import interrupts
 from jaxhom.apprenticeship.lpal import FORMER_METHODS, lpal
 from jaxhom.apprenticeship.lpal import METHODS as LPAL_METHODS
 from jaxhom.cli import pictures, results
 from jaxhom.cli.methods import METHODS, add_method_options, check_method, generalize, wants_progress
-from jaxhom.cli.options import MODEL_HELP, add_command, add_demonstration_options, add_model_options
+from jaxhom.cli.options import (
+    MODEL_HELP,
+    add_command,
+    add_demonstration_options,
+    add_model_options,
+    add_result_options,
+)
 from jaxhom.cli.report import Report
 from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem, load_problem, load_trajectories
@@ -71,9 +76,7 @@ def add_parser(commands: Any) -> None:
     group.add_argument(
         "--features", choices=("states",), help="for models without features: an indicator of every state"
     )
-    group = parser.add_argument_group("results")
-    group.add_argument("--output", required=True, metavar="PATH", help="folder (see below), or policy .npz")
-    group.add_argument("--no-pictures", action="store_true", help="write none")
+    add_result_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -87,14 +90,8 @@ def run(options: argparse.Namespace) -> None:
     check_method(problem, options)
     demonstrations, origin = load_trajectories(problem, options)
     output = Results(options.output)
-    try:
+    with output.kept():
         _learn(problem, demonstrations, origin, options, output)
-    except (Exception, KeyboardInterrupt) as error:
-        if not interrupts.is_interruption(error):
-            raise
-        interrupts.rest()
-        raise KeyboardInterrupt("written so far: " + (", ".join(output.written) or "nothing")) from None
-    print("\nWritten: " + ", ".join(output.written))
 
 
 def _learn(problem: Problem, demonstrations, origin: str, options, output: Results) -> None:
@@ -120,7 +117,7 @@ def _learn(problem: Problem, demonstrations, origin: str, options, output: Resul
         report.lpal(solution)
     if problem.reward is not None:
         report.values({"optimal": problem.plan.policy, **policies})
-    if output.is_folder and not options.no_pictures:
+    if pictures.are_wanted(output, options):
         _draw(problem, demonstrations, general, policy, visited, output)
     report.finish()
 
@@ -167,11 +164,6 @@ def _apprentice(problem: Problem, demonstrations, policy, options):
 
 
 def _draw(problem: Problem, demonstrations, general, policy, visited, output: Results) -> None:
-    try:
-        pictures.load_plotting()
-    except ImportError as error:
-        print(f"\nNo pictures: {error}")
-        return
     output.picture("trajectories", pictures.draw_trajectories(problem, demonstrations))
     if general is not None:
         output.picture("generalization", pictures.draw_generalization(problem, general))

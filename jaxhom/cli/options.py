@@ -95,6 +95,13 @@ def add_demonstration_options(parser: Parser) -> None:
     )
 
 
+def add_result_options(parser: Parser) -> None:
+    """Where results go."""
+    group = parser.add_argument_group("results")
+    group.add_argument("--output", required=True, metavar="PATH", help="folder (see `learn`), or policy .npz")
+    group.add_argument("--no-pictures", action="store_true", help="write none")
+
+
 def positive(text: str) -> int:
     """A whole number from 1 on."""
     number = count(text)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import jax
 
 from jaxhom import interrupts, programs
-from jaxhom.cli import evaluate, explain, learn, main_job, plot
+from jaxhom.cli import ask, evaluate, explain, learn, main_job, plot
 from jaxhom.cli.options import Parser, add_cache_option
 
 _DESCRIPTION = """\
@@ -46,8 +46,8 @@ def make_parser() -> Parser:
     )
     main_job.add_options(parser)
     add_cache_option(parser)
-    commands = parser.add_subparsers(dest="command", title="commands", metavar="{learn,evaluate,explain,plot}")
-    for command in (learn, evaluate, explain, plot):
+    commands = parser.add_subparsers(dest="command", title="commands", metavar="{learn,ask,evaluate,explain,plot}")
+    for command in (learn, ask, evaluate, explain, plot):
         command.add_parser(commands)
     return parser
 

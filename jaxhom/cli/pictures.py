@@ -5,19 +5,22 @@ matplotlib is imported by the functions alone: every other command works without
 
 from __future__ import annotations
 
+import argparse
 import importlib
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxhom.cli.questions import mark
+from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem
 from jaxhom.domains.racetrack import Racetrack
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.planning.occupancy import occupancy
 
 if TYPE_CHECKING:
-    from jaxtyping import ArrayLike, Bool, Float
+    from jaxtyping import ArrayLike, Bool, Float, Int
     from matplotlib.figure import Figure
 
 KINDS = ("policy", "occupancy", "trajectories", "generalization")
@@ -32,6 +35,18 @@ def load_plotting() -> ModuleType:
     plotting = importlib.import_module("jaxhom.plotting")
     importlib.import_module("matplotlib").use("Agg")
     return plotting
+
+
+def are_wanted(output: Results, options: argparse.Namespace) -> bool:
+    """Whether pictures have a folder to go to and can be drawn; says so if it is matplotlib that is missing."""
+    if not output.is_folder or options.no_pictures:
+        return False
+    try:
+        load_plotting()
+    except ImportError as error:
+        print(f"\nNo pictures: {error}")
+        return False
+    return True
 
 
 def draw_policy(
@@ -65,6 +80,18 @@ def draw_trajectories(problem: Problem, demonstrations: Demonstrations) -> Figur
     if problem.domain is None:
         return plotting.plot_trajectories_by_state(demonstrations).figure
     return plotting.plot_trajectories(problem.domain, demonstrations).figure
+
+
+def draw_questions(problem: Problem, demonstrations: Demonstrations, states: Int[np.ndarray, " N"]) -> Figure:
+    """A figure of where the expert is asked next, on the map, which the problem has to have."""
+    plotting = load_plotting()
+    figure = draw_trajectories(problem, demonstrations)
+    for number, state in reversed([*enumerate(states)]):
+        row, column = np.asarray(problem.coordinates)[state]
+        box = {"boxstyle": "round", "facecolor": plotting.YELLOW, "edgecolor": "none"}
+        style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": "small", "zorder": 5, "bbox": box}
+        figure.axes[0].text(column, row, mark(number), **style)
+    return figure
 
 
 def draw_generalization(problem: Problem, general: Any, speed: tuple[int, int] | None = None) -> Figure:

@@ -53,8 +53,9 @@ class Report:
         # Where an episode has ended no action matters, and such states are no part of the counts.
         self._matters = np.ones(mdp.num_states, bool) if terminal is None else ~terminal
         sizes = {"states": mdp.num_states, "actions": mdp.num_actions, "features": mdp.num_features}
-        steps = int(np.asarray(demonstrations.mask).sum())
-        count, num_visited = demonstrations.num_trajectories, int(np.asarray(visited).sum())
+        answers = int(np.asarray(demonstrations.is_answer).sum())
+        steps = int(np.asarray(demonstrations.mask).sum()) - answers
+        count, num_visited = demonstrations.num_trajectories - answers, int(np.asarray(visited).sum())
         self.content: dict[str, Any] = {
             "finished": False,
             "options": {name: value for name, value in vars(options).items() if name not in ("run", "command")},
@@ -69,6 +70,9 @@ class Report:
             self.content["model"]["terminal_states"] = int(terminal.sum())
             rows.append(("states in which episodes end", _share(terminal)))
         rows += [("demonstrations", origin), ("trajectories, steps", f"{count}, {steps}")]
+        if answers:
+            self.content["demonstrations"]["answers"] = answers
+            rows.append(("answers about single states", str(answers)))
         self._tell("problem", [*rows, ("states demonstrated", _share(visited))])
 
     def generalization(self, general: Generalization, numbers: Mapping[str, Any]) -> None:

@@ -4,17 +4,20 @@ OUTPUT/demonstrations.npz    the trajectories that were learned from
 OUTPUT/generalization.npz    with LPAL: the policy that it started from; written before it starts
 OUTPUT/policy.npz            the learned policy [S, A], with visited, radius, support and certificates
 OUTPUT/report.json           everything that is printed, and the settings
+OUTPUT/answers.csv           of `ask`: the expert's answers
 OUTPUT/*.png                 pictures, if matplotlib is installed
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from jaxhom import interrupts
 from jaxhom.interop.files import save_demonstrations, save_policy, whole_file
 from jaxhom.models.demonstrations import Demonstrations
 
@@ -53,7 +56,7 @@ class Results:
         name = "policy.npz" if is_final else "generalization.npz"
         path = os.path.join(self._path, name) if self.is_folder else self._path
         save_policy(path, policy, **arrays)
-        self._note(path)
+        self.note(path)
 
     def demonstrations(self, demonstrations: Demonstrations) -> None:
         """Writes what is learned from."""
@@ -67,13 +70,30 @@ class Results:
         """Writes a figure, and forgets it."""
         self._in_folder(f"{name}.png", lambda path: save_figure(path, figure))
 
+    @contextlib.contextmanager
+    def kept(self) -> Iterator[None]:
+        """Around all that writes: says at the end what was written.
+
+        Raises:
+          KeyboardInterrupt: if it was interrupted, with the files as its message.
+        """
+        try:
+            yield
+        except (Exception, KeyboardInterrupt) as error:
+            if not interrupts.is_interruption(error):
+                raise
+            interrupts.rest()
+            raise KeyboardInterrupt("written so far: " + (", ".join(self.written) or "nothing")) from None
+        print("\nWritten: " + ", ".join(self.written))
+
     def _in_folder(self, name: str, write: Callable[[str], None]) -> None:
         if self.is_folder:
             path = os.path.join(self._path, name)
             write(path)
-            self._note(path)
+            self.note(path)
 
-    def _note(self, path: str) -> None:
+    def note(self, path: str) -> None:
+        """Remembers a file that was written."""
         if path not in self.written:
             self.written.append(path)
 

@@ -76,7 +76,8 @@ def choose_generalization(
 ) -> Choice:
     """Chooses among ways to generalize by the likelihood of trajectories that were left out.
 
-    Each trajectory is left out in turn. A candidate's score is the mean, over all their steps, of log((1 - mixing)
+    Each trajectory is left out in turn; answers about single states (`Demonstrations.with_answers`) never are, and are
+    known to the candidates at every time. A candidate's score is the mean, over all their steps, of log((1 - mixing)
     pi(s, a) + mixing u(s, a)): pi is what it makes of the others, u is uniform over the allowed actions. The highest
     score wins, the first one of equal ones; among the defaults those come first that accept least. What is likeliest
     need not be worth most: `bench/results/report.md` has how far the choice is from the best.
@@ -261,7 +262,8 @@ class _LeftOut:
         self._trajectory, self._state = np.divmod(self._key, shape[0])
         self._total = np.zeros(shape)
         np.add.at(self._total, self._state, self._counts)
-        self._matters = (asked & ~np.asarray(absorbing_states(mdp)))[self._state]
+        is_answer = np.asarray(demonstrations.is_answer)[self._trajectory]
+        self._matters = (asked & ~np.asarray(absorbing_states(mdp)))[self._state] & ~is_answer
         if len(np.unique(self._trajectory[self._matters])) < 2:
             raise ValueError(
                 "demonstrations must have at least two trajectories with steps in which there is something to decide: "
@@ -269,7 +271,7 @@ class _LeftOut:
             )
         self._owner = np.full(shape[0], -1)  # of states that a single trajectory visits
         is_only = np.bincount(self._state, minlength=shape[0]) == 1
-        self._owner[self._state] = np.where(is_only[self._state], self._trajectory, -1)
+        self._owner[self._state] = np.where(is_only[self._state] & ~is_answer, self._trajectory, -1)
 
     def policies(self, name: str, candidate: dict[str, Any] | Callable, progress: bool) -> np.ndarray:
         """[V, A]: what a candidate makes, in the state of each visit, of the other trajectories."""

@@ -4,14 +4,14 @@
 * `from_mdptoolbox`, `from_scipy`: transition matrices.
 * `from_samples`: recorded transitions, with the uncertainty of each row.
 * `demonstrations_from_episodes`, `demonstrations_from_steps`, `demonstrations_from_csv`: trajectories of `imitation`,
-  Minari, arrays and CSV files, with a report of what was dropped.
+  Minari, arrays and CSV files, with a report of what was dropped; `answers_from_csv`: answers about single states.
 * `save_*`, `load_*`: models, demonstrations and policies in `.npz` files, and whatever else is in these.
 
 Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` itself. No other library is imported
 before it is needed.
 """
 
-from jaxhom.interop.csv_steps import demonstrations_from_csv
+from jaxhom.interop.csv_steps import answers_from_csv, demonstrations_from_csv
 from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
 from jaxhom.interop.files import (
@@ -38,6 +38,7 @@ __all__ = [
     "GymnasiumModel",
     "ImportReport",
     "SampledModel",
+    "answers_from_csv",
     "demonstrations_from_csv",
     "demonstrations_from_episodes",
     "demonstrations_from_steps",

@@ -1,8 +1,8 @@
-"""Demonstrations from comma-separated files with one step a line.
+"""Demonstrations from comma-separated files with one step a line, and answers about single states likewise.
 
-The file's first line names the columns; which are needed, and what else is understood, `demonstrations_from_csv` says.
-Whatever is wrong is one `FileError` that names line and column. An episode of nothing but final observations is
-dropped, and the report says so.
+The file's first line names the columns; which are needed, and what else is understood, `demonstrations_from_csv` and
+`answers_from_csv` say. Whatever is wrong is one `FileError` that names line and column. An episode of nothing but final
+observations is dropped, and the report says so.
 """
 
 from __future__ import annotations
@@ -10,16 +10,22 @@ from __future__ import annotations
 import csv
 import itertools
 import os
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jaxhom.interop.files import FileError
 from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport, with_report
 from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 
+if TYPE_CHECKING:
+    from jaxtyping import Int
+
 COLUMNS = ("episode", "state", "action")
+ANSWER_COLUMNS = COLUMNS[1:]
 STEP_COLUMNS = ("step", "t", "time", "timestep")
 
 
@@ -65,23 +71,14 @@ def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) 
     """
     limits = (LARGEST_INDEX,) * 2 if mdp is None else (mdp.num_states, mdp.num_actions)
     lines: dict[str, list[_Line]] = {}
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, strict=True)
-            header = next(reader, [])
-            places, of_step = _places(path, header), _place_of_step(path, header)
-            for row in reader:
-                if row:
-                    _require_fields(path, reader.line_num, row, header)
-                    episode, state, action = _step(path, reader.line_num, row, places, limits)
-                    number = None if of_step is None else _step_number(path, reader.line_num, header, row, of_step)
-                    lines.setdefault(episode, []).append(_Line(reader.line_num, number, state, action))
-    except UnicodeDecodeError as error:
-        raise FileError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
-    except OSError as error:
-        raise FileError(f"{path}: {error.strerror or error}") from None
-    except csv.Error as error:
-        raise FileError(f"{path} line {reader.line_num}: {error}") from None
+    rows = _rows(path)
+    _, header = next(rows)
+    places, of_step = _places(path, header, COLUMNS), _place_of_step(path, header)
+    for line, row in rows:
+        _require_fields(path, line, row, header)
+        episode, state, action = _step(path, line, row, places, limits)
+        number = None if of_step is None else _step_number(path, line, header, row, of_step)
+        lines.setdefault(episode, []).append(_Line(line, number, state, action))
     kept, dropped, final = [], [], 0
     for episode, unsorted in lines.items():
         steps = _in_order(path, unsorted)
@@ -97,17 +94,98 @@ def demonstrations_from_csv(path: str | os.PathLike, *, mdp: MDP | None = None) 
         raise FileError(f"{path}: {error}") from None
 
 
-def _places(path, header: list[str]) -> list[int]:
+def answers_from_csv(path: str | os.PathLike, *, mdp: MDP) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """Reads what an expert said to do in single states: a comma-separated file with one answer a line.
+
+    The first line names the columns. Needed are `state` and `action` (whole numbers from 0 on); others are ignored. A
+    line with an empty action is a question that was not answered, and is skipped.
+
+    Args:
+      path: the file, in UTF-8.
+      mdp: the model, in which every state and action must exist, and be allowed.
+
+    Returns:
+      states: [N], and actions: [N], as `Demonstrations.with_answers` takes them; in the order of the file.
+
+    Raises:
+      FileError: if the file is missing or no text, lacks a column, or has a wrong field (naming line and column).
+
+    Outside jit, vmap and grad only: what is read is checked on the host.
+
+    Example:
+      >>> import jaxhom, pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp(), "answers.csv")
+      >>> _ = path.write_text("state,action\\n5,1\\n7,\\n2,3\\n")
+      >>> states, actions = answers_from_csv(path, mdp=jaxhom.gridworld(3).mdp)
+      >>> states.tolist(), actions.tolist()
+      ([5, 2], [1, 3])
+    """
+    mdp, allowed = as_model(mdp), np.asarray(as_model(mdp).allowed)
+    rows, answers = _rows(path), []
+    _, header = next(rows)
+    places = _places(path, header, ANSWER_COLUMNS)
+    for line, row in rows:
+        _require_fields(path, line, row, header)
+        state, text = _fields(path, line, row, places)
+        number = _whole_number(path, line, "state", state, mdp.num_states)
+        action = _whole_number(path, line, "action", text, mdp.num_actions) if text else None
+        if action is not None and not allowed[number, action]:
+            raise FileError(f"{path} line {line}, column 'action': {action} is not allowed in state {number}")
+        answers += [] if action is None else [(number, action)]
+    states, actions = np.array(answers, int).reshape(-1, 2).T
+    return states, actions
+
+
+def append_answer(path: str | os.PathLike, state: int, action: int) -> None:
+    """Adds a line to a file of answers, in its columns; begins the file if there is none.
+
+    Raises:
+      FileError: if the file is no text or lacks a column.
+      OSError: if it cannot be written.
+    """
+    header, is_new = list(ANSWER_COLUMNS), not os.path.exists(path) or not os.path.getsize(path)
+    if not is_new:
+        _, header = next(_rows(path))
+    fields = [""] * len(header)
+    for place, number in zip(_places(path, header, ANSWER_COLUMNS), (state, action), strict=True):
+        fields[place] = str(number)
+    with open(path, "a+b") as file:
+        lines = [",".join(fields), ""]
+        if is_new:
+            lines = [",".join(header), *lines]
+        elif file.seek(-1, os.SEEK_END) and file.read() not in (b"\n", b"\r"):
+            lines = ["", *lines]
+        file.write("\n".join(lines).encode())
+
+
+def _rows(path: str | os.PathLike) -> Iterator[tuple[int, list[str]]]:
+    """The number and the fields of the first line, empty if there is none, and of all others that are not blank."""
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, strict=True)
+            yield 1, next(reader, [])
+            for row in reader:
+                if row:
+                    yield reader.line_num, row
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
+    except OSError as error:
+        raise FileError(f"{path}: {error.strerror or error}") from None
+    except csv.Error as error:
+        raise FileError(f"{path} line {reader.line_num}: {error}") from None
+
+
+def _places(path, header: list[str], columns: tuple[str, ...]) -> list[int]:
     """Where the columns stand that are needed."""
     names = [name.strip().lower() for name in header]
-    for column in COLUMNS:
+    for column in columns:
         if names.count(column) != 1:
             how = "is missing" if column not in names else "occurs twice"
             found = ", ".join(map(repr, names)) or "nothing"
             raise FileError(
                 f"{path} line 1: column {column!r} {how}; the first line must name the columns, got {found}"
             )
-    return [names.index(column) for column in COLUMNS]
+    return [names.index(column) for column in columns]
 
 
 def _place_of_step(path, header: list[str]) -> int | None:
@@ -126,13 +204,18 @@ def _require_fields(path, line: int, row: list[str], header: list[str]) -> None:
 
 def _step(path, line: int, row: list[str], places: list[int], limits: tuple[int, int]) -> tuple[str, int, int | None]:
     """Episode, state and action of one line; None for an empty action."""
-    if len(row) <= max(places):
-        raise FileError(f"{path} line {line}: {len(row)} fields, but the first line names more columns")
-    episode, state_text, action = (row[place].strip() for place in places)
+    episode, state_text, action = _fields(path, line, row, places)
     if not episode:
         raise FileError(f"{path} line {line}, column 'episode': is empty")
     state = _whole_number(path, line, "state", state_text, limits[0])
     return episode, state, _whole_number(path, line, "action", action, limits[1]) if action else None
+
+
+def _fields(path, line: int, row: list[str], places: list[int]) -> list[str]:
+    """The texts at the given places."""
+    if len(row) <= max(places):
+        raise FileError(f"{path} line {line}: {len(row)} fields, but the first line names more columns")
+    return [row[place].strip() for place in places]
 
 
 def _step_number(path, line: int, header: list[str], row: list[str], place: int) -> int:

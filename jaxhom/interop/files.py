@@ -34,11 +34,13 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
+from jaxhom.models.trajectories import require_flags
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float, Shaped
 
 FORMAT_VERSION = 1
+_ALONE = "marks a trajectory of more than one step"
 
 
 class FileError(ValueError):
@@ -114,7 +116,12 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         checks.require_shape("final_states", final, f"({count},)", final.shape == (count,))
         rows = zip(states, actions, length, final, strict=True)
         trajectories = [(np.append(s[:n], z) if z != -1 else s[:n], a[:n]) for s, a, n, z in rows]
-        return Demonstrations.from_trajectories(trajectories, terminated=arrays.get("terminated"))
+        is_answer = arrays.get("is_answer", np.zeros(count, bool))
+        checks.require_all(
+            "is_answer", is_answer, ~require_flags("is_answer", is_answer, count) | (length == 1), _ALONE
+        )
+        demonstrations = Demonstrations.from_trajectories(trajectories, terminated=arrays.get("terminated"))
+        return demonstrations.replace(is_answer=checks.to_device(is_answer))
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
 
@@ -203,7 +210,9 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     checks.require_all(
         "mask", mask, mask == prefix, "must be True on the first steps of each trajectory and only there"
     )
-    _write(path, {**_fields(demonstrations, "states", "actions", "terminated", "final_states"), "length": length})
+    answers = _fields(demonstrations, "is_answer") if np.asarray(demonstrations.is_answer).any() else {}
+    fields = _fields(demonstrations, "states", "actions", "terminated", "final_states")
+    _write(path, {**fields, **answers, "length": length})
 
 
 def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extras: Shaped[ArrayLike, "..."]) -> None:

@@ -3,6 +3,9 @@
 Trajectories of unequal length are padded to the longest and masked: `states`, `actions` and `mask` are [M, H]. They
 also carry how they ended: an episode that *terminated* is absorbed for good, one that was cut off (truncated) would
 have gone on.
+
+What the expert answered when asked about a single state is a trajectory of one step that is marked as an *answer*. It
+says what is done there as any step does, and nothing of how often or how early the expert comes there.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from jaxhom.models import episode_ends, impossible_steps
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.models.sampling import sample_walks
-from jaxhom.models.trajectories import padded, require_flags
+from jaxhom.models.trajectories import padded, require_flags, with_single_steps
 from jaxhom.programs import quick_jit
 from jaxhom.status import Record
 
@@ -31,8 +34,8 @@ if TYPE_CHECKING:
 class Demonstrations(Record):
     """M trajectories of at most H steps. Build it with `Demonstrations.from_trajectories`.
 
-    `len` is M. `demonstrations[i]` is trajectory i as a pair of NumPy arrays, as `from_trajectories` takes it; a slice
-    or an array selects some of them, as `Demonstrations`.
+    `len` is M, answers included. `demonstrations[i]` is trajectory i as a pair of NumPy arrays, as `from_trajectories`
+    takes it; a slice or an array selects some of them, as `Demonstrations`: `demonstrations[demonstrations.is_answer]`.
 
     Attributes:
       states: int32 [M, H], the state of each step; 0 on padding.
@@ -44,6 +47,8 @@ class Demonstrations(Record):
         episode was cut off, or nobody knows.
       final_states: int32 [M], the state after the last step, in which no action was taken; -1 where it is not known,
         for all if not given.
+      is_answer: bool [M], the trajectories of one step that are answers (`with_answers`): they count where the expert's
+        actions do, and not where time does; False for all if not given.
     """
 
     states: Int[Array, "M H"]
@@ -51,11 +56,12 @@ class Demonstrations(Record):
     mask: Bool[Array, "M H"]
     terminated: Bool[Array, " M"] | None = None
     final_states: Int[Array, " M"] | None = None
+    is_answer: Bool[Array, " M"] | None = None
 
     def __post_init__(self) -> None:
         # Trees of axes or types are built through here too: what stands for the mask stands for these fields as well.
         is_array = hasattr(self.mask, "shape") and len(self.mask.shape) > 0
-        defaults = {"terminated": (False, bool), "final_states": (-1, jnp.int32)}
+        defaults = {"terminated": (False, bool), "final_states": (-1, jnp.int32), "is_answer": (False, bool)}
         for name, (value, dtype) in defaults.items():
             if getattr(self, name) is None:
                 filled = checks.to_device(np.full(self.mask.shape[:-1], value, dtype)) if is_array else self.mask
@@ -87,9 +93,39 @@ class Demonstrations(Record):
         arrays = padded(trajectories, terminated)
         return cls(**{name: checks.to_device(array) for name, array in arrays.items()})
 
+    @checks.eager_where_concrete
+    def with_answers(self, states: Int[ArrayLike, " N"], actions: Int[ArrayLike, " N"]) -> Demonstrations:
+        """The demonstrations, and what the expert said to do in single states.
+
+        Works under `jit` and `vmap`, with states and actions traced. There a state below 0 is no answer, and its step
+        is masked: `query_states` gives -1 where nothing is left to ask.
+
+        An answer is a trajectory of one step that is marked by `is_answer`. `empirical_policy`, and with it all that
+        generalizes, counts it beside the steps that are there. The Monte Carlo mean leaves it out, because its time is
+        not known, and so does the choice of a generalization as one to leave out, because the states asked about are
+        no sample of those that the expert visits.
+
+        Args:
+          states: [N], the states that were asked about; one may occur several times.
+          actions: [N], the answers.
+
+        Returns:
+          Demonstrations [M + N, H].
+
+        Raises:
+          ValueError: if they are not [N] both; where they are concrete, if one is negative or not whole. Whether they
+            exist in a model `validate` says, which whatever takes demonstrations calls.
+
+        Example:
+          >>> shown = Demonstrations.from_trajectories([([0, 1, 2], [1, 1, 0])]).with_answers([4], [1])
+          >>> len(shown), shown.is_answer.tolist(), shown[1]
+          (2, [False, True], (array([4], dtype=int32), array([1], dtype=int32)))
+        """
+        return self.replace(**with_single_steps(self, states, actions))
+
     @property
     def num_trajectories(self) -> int:
-        """M."""
+        """M, answers included."""
         return self.states.shape[-2]
 
     @property
@@ -143,7 +179,7 @@ class Demonstrations(Record):
         shape = self.states.shape
         same = self.actions.shape == shape and self.mask.shape == shape
         checks.require_shape("states, actions and mask", self.actions, f"{shape} alike", same)
-        for name in ("terminated", "final_states"):
+        for name in ("terminated", "final_states", "is_answer"):
             array = getattr(self, name)
             checks.require_shape(name, array, str(shape[:-1]), array.shape == shape[:-1])
 
@@ -217,7 +253,8 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[Bool[Arr
 def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -> Float[Array, " K"]:
     """Feature expectations as the demonstrations' mean, 1/M sum_m sum_t gamma^t phi(s_t, a_t), t from 0.
 
-    Works under `jit`, `vmap` and `grad`, in features and discount.
+    Works under `jit`, `vmap` and `grad`, in features and discount. Answers (`Demonstrations.with_answers`), which say
+    nothing of time, are no part of the mean.
 
     Where an episode terminated, the sum goes on to infinity: gamma^T phi(z) / (1 - gamma) is added, T the number of its
     steps, z the absorbing state that it ended in, phi(z) the mean over the actions allowed there. Where the final state
@@ -233,8 +270,8 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
       [K], in the units of `feature_expectations`.
 
     Raises:
-      ValueError: if a state or action is out of range, an action not allowed, or a trajectory terminated where the
-        model does not absorb. Under a trace such a trajectory is not continued.
+      ValueError: if a state or action is out of range, an action not allowed, all trajectories are answers, or one
+        terminated where the model does not absorb. Under a trace such a trajectory is not continued.
 
     Warns:
       ImpossibleStepsWarning: if steps have probability 0; see `Demonstrations.validate`.
@@ -248,6 +285,8 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
     """
     mdp = as_model(mdp)
     demonstrations.validate(mdp, "warn")
+    if not checks.is_traced(demonstrations.is_answer) and np.asarray(demonstrations.is_answer).all():
+        raise ValueError("all trajectories are answers about single states, which say nothing of time")
     is_little = checks.is_at_hand(mdp, demonstrations)  # the sums take less time than any program compiles
     expectations, is_lost = (_expected_at_hand if is_little else _expectations)(mdp, demonstrations)
     if not checks.is_traced(is_lost):
@@ -256,12 +295,14 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
 
 
 def _expected(mdp: MDP, demonstrations: Demonstrations) -> tuple[Float[Array, " K"], Bool[Array, " M"]]:
+    walks = ~demonstrations.is_answer
+    demonstrations = demonstrations.replace(mask=demonstrations.mask & walks[:, None])
     steps = jnp.arange(demonstrations.horizon)
     weight = jnp.where(demonstrations.mask, mdp.discount**steps, 0.0)
     # Weights are summed per pair first: [M, H, K] would not fit for long demonstrations and many features.
     pairs, is_lost = episode_ends.absorbed_time(mdp, demonstrations)
     pairs = pairs.at[demonstrations.states, demonstrations.actions].add(weight)
-    return jnp.einsum("sa,sak->k", pairs, mdp.features) / demonstrations.num_trajectories, is_lost
+    return jnp.einsum("sa,sak->k", pairs, mdp.features) / walks.sum(), is_lost
 
 
 _expectations, _expected_at_hand = jax.jit(_expected), quick_jit(_expected)

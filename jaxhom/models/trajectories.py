@@ -1,6 +1,6 @@
 """Trajectories as users have them, pairs of sequences of unequal length: checked, and padded to the longest.
 
-On the host: nothing here works under `jit`, `vmap` or `grad`.
+On the host: nothing here but `with_single_steps` works under `jit`, `vmap` or `grad`.
 """
 
 from __future__ import annotations
@@ -54,6 +54,33 @@ def _in_rows(rows: list[tuple[np.ndarray, np.ndarray]], horizon: int) -> dict[st
         mask[i, :length] = True
         final_states[i] = row_states[length] if len(row_states) > length else -1
     return {"states": states, "actions": actions, "mask": mask, "final_states": final_states}
+
+
+def with_single_steps(demonstrations: Any, states: Any, actions: Any) -> dict[str, Any]:
+    """The fields of demonstrations by name, with N answers behind them; see `Demonstrations.with_answers`."""
+    given = {"states": states, "actions": actions}
+    if not checks.is_traced(given):
+        given = {name: checks.as_host_array(name, array) for name, array in given.items()}
+    count = np.size(states)
+    for name, array in given.items():
+        checks.require_shape(name, array, f"({count},), as many states as actions", np.shape(array) == (count,))
+        if not checks.is_traced(array):
+            given[name] = checks.require_integers(name, np.asarray(array, None if count else int), 2**31 - 1)
+    xp = checks.arrays_of(demonstrations, given)
+    is_given = xp.asarray(given["states"]) >= 0
+    is_first = np.arange(demonstrations.horizon) == 0
+    mask = is_given[:, None] & is_first
+    rows = {
+        **{name: xp.where(mask, xp.asarray(array, np.int32)[:, None], 0) for name, array in given.items()},
+        "mask": mask,
+        "terminated": np.zeros(count, bool),
+        "final_states": np.full(count, -1, np.int32),
+        "is_answer": np.ones(count, bool),
+    }
+    return {
+        name: checks.to_device(xp.concatenate([xp.asarray(getattr(demonstrations, name)), more]))
+        for name, more in rows.items()
+    }
 
 
 def require_no_steps(pairs: Sequence[tuple[int, Any]], kind: str) -> None:

@@ -106,7 +106,7 @@ def plot_occupancy_by_state(
 
 
 def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None = None) -> Axes:
-    """Draws trajectories as lines: the state over the steps, with a ring where each begins.
+    """Draws trajectories as lines: the state over the steps, with a ring where each begins; no answers, without time.
 
     Args:
       trajectories: M of them.
@@ -124,7 +124,7 @@ def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None 
       'step'
     """
     ax = _axes(ax, height=3.2)
-    for states in unpadded(trajectories):
+    for states in unpadded(trajectories[~np.asarray(trajectories.is_answer)]):
         ax.plot(states, color=VERMILLION, linewidth=1.0, marker="o", markersize=2.5, alpha=0.7)
         ax.plot(0, states[0], "o", markersize=7, markerfacecolor="white", markeredgecolor=VERMILLION)
     ax.set(xlabel="step", ylabel="state")

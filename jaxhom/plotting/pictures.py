@@ -172,7 +172,7 @@ def plot_trajectories(
     """Draws trajectories as lines with a dot per step and a ring in every cell where one begins.
 
     Several trajectories run side by side: from its ring on, each has an offset of its own from the
-    centres of the cells.
+    centres of the cells. Answers about single states are rings alone.
     On a racetrack a line is cut where the car is put back from the finish to the start.
 
     Args:
@@ -199,9 +199,10 @@ def plot_trajectories(
     board = board_of(domain)
     trajectories.validate(board.mdp, "ignore")
     ax = ground(board, ax) if ax is None else ax
-    num = trajectories.num_trajectories
-    offset = _SPREAD * (np.arange(num) - (num - 1) / 2) / max(num - 1, 1)
-    width = 1.6 if num == 1 else 1.0
+    walks = ~np.asarray(trajectories.is_answer)
+    num = walks.sum()
+    offset = _SPREAD * (np.cumsum(walks) - (num + 1) / 2) / max(num - 1, 1)
+    width = 1.6 if num <= 1 else 1.0
     style: dict[str, Any] = {"color": color, "linewidth": width, "marker": "o", "markersize": 1.0 + 1.6 * width}
     paths = [states // board.per_cell for states in unpadded(trajectories)]
     for m, path in enumerate(paths):

@@ -6,6 +6,7 @@ draw is therefore the same whatever the batch, the method, or what was computed 
 
 import dataclasses
 import functools
+import math
 import operator
 import pathlib
 import zlib
@@ -22,6 +23,7 @@ from bench.road_graph import road_graph
 from bench.settings import Setting
 from jaxhom import MDP, Demonstrations, Plan
 from jaxhom.interop import from_gymnasium
+from jaxhom.models.mdp import absorbing_states
 
 _FROZEN = 0.85  # of the cells of a lake
 _TRACKS = pathlib.Path(__file__).resolve().parent / "tracks"
@@ -36,6 +38,7 @@ class Domain:
         what needs no features is compiled once per domain.
       coordinates: [S, 2].
       weights: [K], true reward weights; None where each draw has its own.
+      true_features: [S, A, K'] that the reward is made of where they are not the learner's; None where they are.
       labels: [S, A, L], what else is known of states and actions; None for nothing.
       terminal: bool [S], and off_road: [S, A]; None on grids.
     """
@@ -44,6 +47,7 @@ class Domain:
     bare: MDP
     coordinates: jax.Array
     weights: jax.Array | None = None
+    true_features: jax.Array | None = None
     labels: np.ndarray | None = None
     terminal: jax.Array | None = None
     off_road: jax.Array | None = None
@@ -54,7 +58,8 @@ class Problem:
     """B draws of a setting.
 
     Attributes:
-      reward: [B, S, A]. expert: plans with a leading axis [B].
+      seed: that the draws come from.
+      weights: [B, K'], of the true reward. reward: [B, S, A]. expert: plans with a leading axis [B].
       demonstrations: B of them; see `_shown`.
       models: what the learner of each draw knows of the model; the true one unless the setting says otherwise.
       trial_keys: [B], for sampled trials.
@@ -64,6 +69,8 @@ class Problem:
     setting: Setting
     domain: Domain
     draws: tuple[int, ...]
+    seed: int
+    weights: jax.Array
     reward: jax.Array
     expert: Plan
     demonstrations: list[Demonstrations]
@@ -84,13 +91,15 @@ def draw_problem(setting: Setting, draws: tuple[int, ...], seed: int) -> Problem
     key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(setting.source.encode()))
     keys = jax.vmap(lambda draw: jax.random.split(jax.random.fold_in(key, draw), 4))(jnp.array(draws))
     weight_keys, sample_keys, trial_keys, model_keys = keys.T
-    reward = _rewards(domain, weight_keys)
+    weights, reward = _rewards(domain, weight_keys)
     expert = _plans(domain, reward)
     samples = _sample(sample_keys, domain.bare, expert.policy, setting.pool, setting.length)
     return Problem(
         setting=setting,
         domain=domain,
         draws=tuple(draws),
+        seed=seed,
+        weights=weights,
         reward=reward,
         expert=expert,
         demonstrations=_shown(setting, domain, samples),
@@ -105,8 +114,12 @@ def build_domain(name: str, regions: int) -> Domain:
     if name.startswith("grid"):
         world = jaxhom.gridworld(int(name[4:]), num_regions=regions)
         return Domain(world.mdp, _without_features(world.mdp), world.coordinates)
+    if name.startswith("wrong"):
+        return _misled_grid(int(name.removeprefix("wrong")), regions)
     if name.startswith("lake"):
         return _lake(int(name[4:]))
+    if name.startswith("tiles"):
+        return _tiled_lake(int(name.removeprefix("tiles")))
     if name == "road":
         return _road()
     letter = name.removeprefix("track_")
@@ -125,6 +138,30 @@ def _lake(size: int) -> Domain:
     mdp = found.mdp.replace(features=goal[:, None])
     coordinates = np.stack(np.divmod(np.arange(size**2), size), axis=1)
     return Domain(mdp, _without_features(mdp), jnp.asarray(coordinates), weights=jnp.ones(1))
+
+
+def _tiled_lake(size: int) -> Domain:
+    """The lake with features of its goal, of its holes, and of the ice in each tile of 2 x 2 cells."""
+    lake = _lake(size)
+    row, column = np.asarray(lake.coordinates).T
+    goal = np.asarray(lake.mdp.features)[:, 0, 0] > 0
+    hole = np.asarray(absorbing_states(lake.mdp)) & ~goal
+    tile = (row // 2) * -(-size // 2) + column // 2
+    ice = (tile[:, None] == np.arange(tile.max() + 1)) & ~(goal | hole)[:, None]
+    features = np.column_stack([goal, hole, ice[:, ice.any(axis=0)]]).astype(float)
+    weights = jnp.asarray(np.arange(features.shape[1]) == 0, lake.mdp.dtype)
+    return dataclasses.replace(lake, mdp=lake.mdp.replace(features=features), weights=weights)
+
+
+def _misled_grid(size: int, regions: int) -> Domain:
+    """A gridworld whose learner sees regions of four times the side, shifted by a cell, of which it rewards nothing."""
+    world = jaxhom.gridworld(size, num_regions=regions)
+    side = 4 * (size // math.isqrt(regions))
+    row, column = (np.asarray(world.coordinates).astype(int).T + 1) // side
+    region = row * (column.max() + 1) + column
+    features = (region[:, None] == np.arange(region.max() + 1)).astype(float)
+    mdp = world.mdp.replace(features=features)
+    return Domain(mdp, _without_features(mdp), world.coordinates, true_features=world.mdp.features)
 
 
 def _road(destination: int = 0) -> Domain:
@@ -152,13 +189,14 @@ def _without_features(mdp: MDP) -> MDP:
     return mdp.replace(features=mdp.features[..., :0])
 
 
-def _rewards(domain: Domain, keys) -> jax.Array:
-    """True rewards [B, S, A]."""
+def _rewards(domain: Domain, keys) -> tuple[jax.Array, jax.Array]:
+    """True weights [B, K'] and rewards [B, S, A]."""
     if domain.weights is not None:
-        reward = domain.mdp.features @ domain.weights
-        return jnp.broadcast_to(reward, (len(keys), *reward.shape))
-    weights = jax.vmap(lambda key: jaxhom.sample_weights(key, domain.mdp.num_features))(keys)
-    return jnp.einsum("sak,bk->bsa", domain.mdp.features, weights.astype(domain.mdp.dtype))
+        shared = domain.weights, domain.mdp.features @ domain.weights
+        return tuple(jnp.broadcast_to(one, (len(keys), *one.shape)) for one in shared)
+    features = domain.mdp.features if domain.true_features is None else domain.true_features
+    weights = jax.vmap(lambda key: jaxhom.sample_weights(key, features.shape[-1]))(keys).astype(domain.mdp.dtype)
+    return weights, jnp.einsum("sak,bk->bsa", features, weights)
 
 
 def _plans(domain: Domain, reward: jax.Array) -> Plan:

@@ -1,4 +1,4 @@
-"""Computes rows: `python -m bench.reproduce table1 | figure1 | questions | relations`.
+"""Computes rows: `python -m bench.reproduce SWEEP`, of which `--help` lists the names.
 
 Rows go to `<output>/raw/*.csv` as they are computed, summaries to `<output>/*.csv` at the end. A sweep that was stopped
 goes on where it was when it is started again; `--draws` may grow in between. `python -m bench.report` turns rows into
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import jax
 
-from bench import methods, relations, settings, summaries, sweep
+from bench import guarantees, learners, methods, queries, relations, settings, summaries, sweep
 from bench.provenance import RESULTS
 from bench.rows import RowFile
 from bench.sweep import Sweep
@@ -33,6 +33,9 @@ SWEEPS = {
         "roads": Sweep(settings.roads_question(), relations.WITH_LABELS, draws=50),
         "transfer": Sweep(settings.transfer_question(), relations.ACROSS, draws=50),
     },
+    "learners": {"learners": Sweep(settings.learners_question(), learners.LEARNERS, draws=50)},
+    "guarantees": {"guarantees": Sweep(settings.guarantees_question(), guarantees.GUARANTEES, draws=50)},
+    "queries": {"queries": Sweep(settings.queries_question(), queries.QUERIES, draws=50)},
 }
 """By command, and by the name of the sweep's files."""
 
@@ -101,9 +104,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line's options."""
     made = argparse.ArgumentParser(prog="python -m bench.reproduce", description=__doc__.splitlines()[0])
     made.add_argument("sweep", choices=SWEEPS)
-    made.add_argument(
-        "--draws", "--sets", type=int, help="draws per row (default: table1 100, figure1 and relations 50, else 20)"
-    )
+    made.add_argument("--draws", "--sets", type=int, help="draws per row (default: table1 100, questions 20, else 50)")
     made.add_argument("--rows", nargs="+", default=[], help="only these settings: grid16, grid16/64, track_a/2")
     made.add_argument("--methods", nargs="+", default=[], help="only these methods")
     made.add_argument("--seed", type=int, default=0, help="of all random numbers (default 0)")

@@ -11,6 +11,12 @@ TRACK_LENGTHS = {"track_a": (20, 30), "track_b": (40, 50), "track_corner": (10, 
 """Steps of a demonstration and of a trial (section VI.B); the corner is a small track of ours (`tracks/`)."""
 OTHER_LENGTHS = {"lake8": (40, 100), "lake16": (80, 200), "road": (40, 60)}
 """Steps of a demonstration and of a trial on frozen lakes and on a road network."""
+TILED_LENGTHS = {"tiles8": (40, 100), "tiles16": (80, 200)}
+"""Likewise on the same lakes with features of their goal, holes and tiles of ice."""
+QUESTIONS_PER_ROUND = {"tiles8": 5}
+"""How many states are asked about before the next policy is learned; 20 where nothing else is said."""
+WEIGHT_SUMS = {"track_a": 205.0, "track_b": 205.0}
+"""What the weights of the true reward sum to where that is not 1: losses are compared in weights of sum 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +67,16 @@ def grid(size: int, regions: int, demonstrations: int = GRID_DEMONSTRATIONS, poo
 def track(domain: str, demonstrations: int, pool: int, **options) -> Setting:
     """A racetrack of section VI.B."""
     return Setting(domain, 0, demonstrations, pool, *TRACK_LENGTHS[domain], **options)
+
+
+def tiled(domain: str, demonstrations: int, pool: int) -> Setting:
+    """A lake whose features are its goal, its holes and tiles of 2 x 2 cells."""
+    return Setting(domain, 0, demonstrations, pool, *TILED_LENGTHS[domain])
+
+
+def misled(size: int, regions: int, demonstrations: int, pool: int) -> Setting:
+    """A gridworld whose learner has features of the wrong regions (`problems.build_domain`)."""
+    return Setting(f"wrong{size}", regions, demonstrations, pool, GRID_LENGTHS[size], GRID_LENGTHS[size])
 
 
 def other(domain: str, demonstrations: int, pool: int) -> Setting:
@@ -121,6 +137,28 @@ def roads_question() -> list[Setting]:
 def transfer_question() -> list[Setting]:
     """The second racetrack; what is demonstrated is the first one (`relations.across`)."""
     return [track("track_b", count, 30) for count in (2, 5)]
+
+
+_FEW = (1, 2, 5, 10, 20)
+
+
+def learners_question() -> list[Setting]:
+    """Where learners of weights are compared with generalizations: right features, wrong ones, telling ones."""
+    grids = [make(16, 64, count, 20) for make in (grid, misled) for count in _FEW]
+    tracks = [track(name, count, 30) for name in ("track_a", "track_b") for count in (2, 5, 10, 20)]
+    return grids + tracks + [tiled(name, count, 20) for name in TILED_LENGTHS for count in _FEW]
+
+
+def guarantees_question() -> list[Setting]:
+    """As for learners, but for wrong features, in which the true reward has no weights."""
+    return [setting for setting in learners_question() if not setting.domain.startswith("wrong")]
+
+
+def queries_question() -> list[Setting]:
+    """Where single states are asked about, after 2 and 5 demonstrations."""
+    grids = [make(16, 64, count, 20) for make in (grid, misled) for count in (2, 5)]
+    tracks = [track(name, count, 30) for name in ("track_a", "track_b") for count in (2, 5)]
+    return grids + tracks + [tiled(name, count, 20) for name in TILED_LENGTHS for count in (2, 5)]
 
 
 def normalisation_question() -> list[Setting]:

@@ -59,7 +59,8 @@ class _Task:
     def work(self) -> int:
         """A rough measure of a method's cost: states times missing draws, the compiler's share included."""
         domain = self.setting.domain
-        num_states = int(domain[4:]) ** 2 if domain.startswith("grid") else 5000
+        size = domain.lstrip("abcdefghijklmnopqrstuvwxyz_")  # of grids and lakes
+        num_states = int(size) ** 2 if size else 5000
         return (num_states + 500) * len(self.draws)
 
 

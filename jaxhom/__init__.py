@@ -30,8 +30,8 @@ from jaxhom.generalization.result import Generalization
 from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
 from jaxhom.guarantees.loss_bound import LossBound, loss_bound
-from jaxhom.guarantees.robust_policy import RobustPolicy, robust_policy
 from jaxhom.guarantees.queries import Queries, query_states
+from jaxhom.guarantees.robust_policy import RobustPolicy, robust_policy
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,

@@ -23,7 +23,8 @@ from jaxhom.apprenticeship.presolve import Reach
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.planning import policy_iteration
-from jaxhom.planning.occupancy import policy_from_occupancy
+from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
+from jaxhom.planning.optimal import optimal_policy
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -45,40 +46,45 @@ class Responder:
     """
 
     def __init__(self, sides: ExactSides, tolerance: float):
-        self._exact, self._error = sides.exact, _DIGITS * tolerance
+        self._mdp, self._exact, self._error = sides.mdp, sides.exact, _DIGITS * tolerance
         self.pool, self._numbers = PolicyPool(sides.mdp), dict[bytes, int]()
         self._value = np.zeros(sides.mdp.num_states)
 
     def respond(self, weights: Float[np.ndarray, " K"]) -> tuple[float, int]:
         """What no policy's w . V is above, and the number of the best policy in the pool."""
-        most, self._value, actions = self._exact.plan(weights, self._guess(weights), None, self._error)
+        most, self._value, actions = self._exact.plan(weights, self.guess(weights), None, self._error)
         key = actions.tobytes()
         if key not in self._numbers:
             policy = np.eye(self._exact.allowed.shape[1])[actions]
-            guess = self._occupancy_of(actions) if self._exact.is_direct else None
-            mu, expected, _ = self._exact.expectations(policy, guess, self._error)
+            mu, expected, _ = self._exact.expectations(policy, self._occupancy(actions, policy), self._error)
             self._numbers[key] = self.pool.add(mu, actions, expected)
         return most, self._numbers[key]
 
     def add(self, policy: Float[np.ndarray, "S A"]) -> int:
         """Takes a policy that may be random."""
         policy = exact_rows(policy, np.float64)
-        mu, expected, _ = self._exact.expectations(policy, None, self._error)
+        mu, expected, _ = self._exact.expectations(policy, self._occupancy(policy, policy), self._error)
         return self.pool.add(mu, policy, expected)
 
-    def _guess(self, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
-        """Values of the best policy for the weights: where LU is quick, with few factorisations, from the last ones."""
+    def guess(self, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
+        """Values of the best policy for the weights, from the last ones: with few factorisations, or by a program."""
         exact = self._exact
-        if not exact.is_direct:
-            return self._value
         reward = (exact.features @ weights).reshape(len(self._value), -1)
         reward = np.where(exact.allowed, reward, -np.inf)
+        if not exact.is_direct:
+            plan = optimal_policy(self._mdp, reward.astype(self._mdp.dtype), initial_value=self._value)
+            return np.asarray(plan.value, np.float64)
         start = (reward + exact.discount * exact.model.expected_next_value(self._value)).argmax(axis=1)
         found = policy_iteration.iterate(exact.model, reward, start, float(np.finfo(float).eps))
         return self._value if found is None else found.value
 
-    def _occupancy_of(self, actions: Int[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
-        return self._exact.model.chain(actions).state_occupancy(self._exact.initial)
+    def _occupancy(
+        self, choice: Int[np.ndarray, " S"] | Float[np.ndarray, "S A"], policy: Float[np.ndarray, "S A"]
+    ) -> Float[np.ndarray, " S"]:
+        """That of the states, of a policy and its actions or itself."""
+        if self._exact.is_direct:
+            return self._exact.model.chain(choice).state_occupancy(self._exact.initial)
+        return np.asarray(occupancy(self._mdp, policy), np.float64).sum(axis=1)
 
 
 class Outcome:
@@ -88,6 +94,7 @@ class Outcome:
       sides: the model.
       x: [S, A], the mixture's occupancy.
       weights: [K], as the learner has them.
+      value: [S], a guess of the best values for them.
       expectations: [K], as the caller gave them. tolerance: of the lane.
 
     Attributes:
@@ -98,10 +105,10 @@ class Outcome:
       advantage: scalar, no policy's weights . (V - expectations) is larger.
     """
 
-    def __init__(self, sides: ExactSides, x, weights, expectations, tolerance: float):
+    def __init__(self, sides: ExactSides, x, weights, value, expectations, tolerance: float):
         dtype, error = np.dtype(sides.mdp.dtype), _DIGITS * tolerance
         self.weights = weights.astype(dtype)
-        self.advantage, actions = sides.advantage(self.weights.astype(np.float64), expectations, None, error)
+        self.advantage, actions = sides.advantage(self.weights.astype(np.float64), expectations, value, error)
         best = np.eye(x.shape[1])[actions]
         self.greedy_policy = best.astype(dtype)
         self.policy = exact_rows(policy_from_occupancy(sides.mdp, x, best, _NO_OCCUPANCY), dtype)

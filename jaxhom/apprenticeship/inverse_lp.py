@@ -41,7 +41,9 @@ from jaxhom.status import Status
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float, Int
 
-_ACCURACY = 1e-6  # share of what one term can be by which HiGHS may miss
+# In float64, and in shorter types: by what share of the largest that a term can be the program may be missed, and
+# what share rounding makes of ties, which the policies of planners have.
+_ACCURACY, _SLACK = (1e-6, 1e-4), (1e-8, 1e-5)
 _MOST_NUMBERS = 2**27  # of the program's rows, which are dense: 1 GB
 
 
@@ -61,7 +63,8 @@ def inverse_lp(
     most: max_w sum_s min_a (V(s) - Q(s, a)) - l1 |w|_1 over |w_k| <= max_weight, subject to V(s) >= Q(s, a) for all
     allowed actions, with V and Q the values of the policy and the minimum over the allowed actions that it does not
     take. If it is random, all actions that it takes with positive probability must be optimal alike, V(s) = Q(s, a).
-    States in which no other action is allowed have no term.
+    States in which no other action is allowed have no term. Constraints may be missed by 1e-8 (1e-5 for models in
+    float32) of the largest number that a weight can make of a term: rounding leaves no reward else where actions tie.
 
     Given demonstrations, the weights for which their mean discounted features (`monte_carlo_feature_expectations`,
     Vhat) are worth more than those of the policies met so far: max_w sum_i p(w . (Vhat - V(pi_i))) - l1 |w|_1 in the
@@ -139,7 +142,8 @@ def _from_policy(mdp: MDP, policy: Float[np.ndarray, "S A"], options: dict) -> L
     is_tied = takes & (takes.sum(axis=1, keepdims=True) > 1)
     others = allowed & ~takes
     groups = np.unique(np.nonzero(others)[0], return_inverse=True)[1]
-    program = SumOfMinima(losses[others], groups, losses[is_tied], is_floored=True, **options)
+    slack = _of_type(mdp, _SLACK)
+    program = SumOfMinima(losses[others], groups, losses[is_tied], is_floored=True, slack=slack, **options)
     weights, bound = program.solve()
     return _learned(mdp, program, weights, bound, policy, 1, Status.SOLVED)
 
@@ -170,7 +174,7 @@ def _from_demonstrations(mdp: MDP, demonstrations: Demonstrations, options: dict
     expert = np.asarray(monte_carlo_feature_expectations(mdp, demonstrations), np.float64)
     sides = ExactSides(mdp)
     # Values are in units of the largest weight and feature.
-    error = _ACCURACY * options["largest"] * (np.abs(np.asarray(mdp.features)).max() or 1.0)
+    error = _of_type(mdp, _ACCURACY) * options["largest"] * (np.abs(np.asarray(mdp.features)).max() or 1.0)
     responder = Responder(sides, float(error))
     responder.add(np.asarray(uniform_policy(mdp), np.float64))
     iterations, status = 0, Status.ITERATION_LIMIT
@@ -202,8 +206,7 @@ def _learned(
     given = weights.astype(dtype)
     weights = given.astype(np.float64)
     value = program.value(weights)
-    share = _ACCURACY if dtype == np.float64 else 100.0 * _ACCURACY
-    term = share * program.largest * program.unit
+    term = _of_type(mdp, _ACCURACY) * program.largest * program.unit
     terms = max(1, len(np.unique(program.groups)))
     is_exact = program.violation(weights) <= term and bound - value <= terms * term
     if status == Status.SOLVED and not is_exact:
@@ -229,3 +232,7 @@ def _learned(
         status=np.int32(status),
     )
     return jax.tree.map(checks.to_device, learned)
+
+
+def _of_type(mdp: MDP, shares: tuple[float, float]) -> float:
+    return shares[0] if mdp.dtype == np.float64 else shares[1]

@@ -126,10 +126,12 @@ class _Best:
 
 @dataclasses.dataclass(frozen=True)
 class _Found:
-    """What the rounds of a lane have found: the average occupancy [S, A], weights [K], rounds, the end."""
+    """What the rounds of a lane have found: the average occupancy [S, A], weights [K] and values [S] for them, rounds,
+    the end."""
 
     x: Float[np.ndarray, "S A"]
     weights: Float[np.ndarray, " K"]
+    value: Float[np.ndarray, " S"]
     iterations: int
     status: Status
 
@@ -165,11 +167,11 @@ def _rounds(sides: ExactSides, reach: Reach, expectations: Float[np.ndarray, " K
         status = Status.SOLVED if best.bound - margin <= goal else status
     weights = np.zeros(len(plays))
     weights[plays] = simplex_point(best.weights)
-    return _Found(mixture(responder.pool, counts / count), weights, count, status)
+    return _Found(mixture(responder.pool, counts / count), weights, responder.guess(weights), count, status)
 
 
 def _certified(sides: ExactSides, expectations: Float[np.ndarray, " K"], tolerance: float, found: _Found) -> Learned:
-    outcome = Outcome(sides, found.x, found.weights, expectations, tolerance)
+    outcome = Outcome(sides, found.x, found.weights, found.value, expectations, tolerance)
     dtype, eps = outcome.policy.dtype, np.finfo(float).eps
     margin = (outcome.low - expectations - 2.0 * eps * (np.abs(outcome.low) + np.abs(expectations))).min()
     weights = outcome.weights.astype(np.float64)

@@ -44,7 +44,7 @@ def projection(
     mdp: MDP,
     expectations: Float[ArrayLike, "*B K"],
     *,
-    method: str = "projection",
+    method: str = "max_margin",
     tolerance: float | Float[ArrayLike, " B"] | None = None,
     max_iterations: int = 1000,
 ) -> Learned:
@@ -58,9 +58,9 @@ def projection(
       mdp: the model, with K >= 1 features.
       expectations: [K] or a batch [B, K], discounted feature expectations of the expert, in the units of
         `feature_expectations` (sums over time). No policy need reach them.
-      method: "projection", the paper's simpler algorithm: quick rounds, many of them where the expectations are out of
-        reach. "max_margin", its quadratic program: the nearest mixture of all policies met in every round, exactly;
-        ends after few rounds.
+      method: "max_margin", the paper's quadratic program: in every round the nearest mixture of all policies met,
+        exactly, so that few rounds do. "projection", its simpler algorithm: each round projects onto the way to the
+        new policy alone; where the expectations are out of reach that zigzags, and takes hundreds of rounds or more.
       tolerance: objective - bound to settle for; [B] for each lane its own. By default 1e-4 / (1 - discount) times the
         most that a feature can do in a step, its range.
       max_iterations: best responses, per lane, after which to stop.
@@ -131,10 +131,12 @@ _METHODS: dict[str, Mix] = {"projection": _step_towards, "max_margin": _nearest_
 
 @dataclasses.dataclass(frozen=True)
 class _Found:
-    """What the rounds of a lane have found: the mixture's occupancy [S, A], weights [K], best responses, the end."""
+    """What the rounds of a lane have found: the mixture's occupancy [S, A], weights [K] and values [S] for them, best
+    responses, the end."""
 
     x: Float[np.ndarray, "S A"]
     weights: Float[np.ndarray, " K"]
+    value: Float[np.ndarray, " S"]
     iterations: int
     status: Status
 
@@ -163,11 +165,11 @@ def _rounds(sides: ExactSides, expectations: Float[np.ndarray, " K"], goal: floa
             status = Status.SOLVED
         elif not after < before:  # the best response is no nearer: rounding has the last word
             status = Status.STALLED
-    return _Found(mixture(responder.pool, shares), weights, iterations, status)
+    return _Found(mixture(responder.pool, shares), weights, responder.guess(weights), iterations, status)
 
 
 def _certified(sides: ExactSides, expectations: Float[np.ndarray, " K"], tolerance: float, found: _Found) -> Learned:
-    outcome = Outcome(sides, found.x, found.weights, expectations, tolerance)
+    outcome = Outcome(sides, found.x, found.weights, found.value, expectations, tolerance)
     dtype, eps = outcome.policy.dtype, np.finfo(float).eps
     farthest = np.maximum(np.abs(expectations - outcome.low), np.abs(expectations - outcome.high))
     length = np.linalg.norm(outcome.weights.astype(np.float64))

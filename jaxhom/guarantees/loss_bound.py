@@ -28,7 +28,7 @@ from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.solvers.blas_threads import one_blas_thread
-from jaxhom.status import Record, Status, summary
+from jaxhom.status import Record, Status
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -42,7 +42,7 @@ _AGREEMENT = 16.0  # roundings of the model's type within which two rows of a po
 class LossBound(Record):
     """How much a policy can lose; with a batch of B policies every field gains a leading axis [B].
 
-    All numbers are discounted sums, in the units of V. They hold whatever the status is. `print` says them in words.
+    All numbers are discounted sums, in the units of V. Bounds hold whatever the status is. `print` says them in words.
 
     Attributes:
       bound: scalar, no less than what the expert is worth more than the policy: for the weights that were given, or, if
@@ -52,9 +52,10 @@ class LossBound(Record):
       gaps: [K], optima - expectations: the bound for each feature as the reward.
       worst: int32 scalar, the feature of the largest gap; with weights, of the largest weighted gap.
       contributions: [S], what each state adds to the bound: how often the policy that maximises the worst feature
-        (each of the weighted features) meets the state, times how much better it does there in one step. They can be
-        negative only where rounding is, or where the policy and the expert are known to differ. They sum to the bound,
-        but for what it is rounded up by, see `loss_bound`.
+        (each of the weighted features) meets the state, times how much better its step is there than the policy's, if
+        the policy goes on afterwards. 0 in states of S^E in which the policy does what the expert does. Some can be
+        negative: steps that pay only if the better policy goes on. They sum to the bound, but for what it is rounded
+        up by, see `loss_bound`.
       agreed: bool [S], the states S^E in which the expert is known: demonstrated, and something was to be decided.
       weights: [K], as given; None if none were.
       status: int32 scalar, a `jaxhom.Status`: SOLVED where every feature's optimum was found, and the policy's values.
@@ -251,6 +252,6 @@ def _in_words(loss: LossBound) -> str:
             f"states that contribute most: {names}",
             "assumes the true model, and an expert that is deterministic (or whose frequencies are exact) on the "
             f"{int(np.asarray(loss.agreed).sum())} demonstrated states",
-            summary("LossBound", {"status": loss.status}),
+            f"status: {Status(int(loss.status)).name}",
         ]
     )

@@ -1,12 +1,13 @@
 """A sum of minima of linear functions, less a penalty, made largest in a box: a small linear program for HiGHS.
 
-    max_w  sum_g min_{j in g} d_j . w  -  lambda |w|_1     over  |w_k| <= M  (or 0 <= w_k <= M),  E w = 0,
+    max_w  sum_g min_{j in g} d_j . w  -  lambda |w|_1     over  |w_k| <= M  (or 0 <= w_k <= M),  |E w| <= eps,
 
-and, where that is asked for, no minimum below 0. Each minimum is a variable m_g <= d_j . w, and w = p - n.
+and, where that is asked for, no minimum below -eps. Each minimum is a variable m_g <= d_j . w, and w = p - n. Where
+constraints meet in a line, rounding leaves nothing but 0 if they have to hold exactly: hence eps.
 
-What multipliers prove. Multipliers y_j >= 0 of the rows whose sums over every group are 1 (at least 1 where no minimum
-may be below 0), and any z of E w = 0, make g = D' y + E' z, and no weights are worth more than
-M sum_k max(0, |g_k| - lambda), with g_k in place of |g_k| if w >= 0.
+What multipliers prove. Multipliers y_j >= 0 of the rows whose sums T_g over every group are 1 (at least 1 where no
+minimum may be below -eps), and any z of E w, make h = D' y + E' z, and no weights are worth more than
+M sum_k max(0, |h_k| - lambda) + eps (sum_g (T_g - 1) + |z|_1), with h_k in place of |h_k| if w >= 0.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import scipy
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_ACCURACY = 1e-9  # of HiGHS, with rows of numbers of at most 1
+_ACCURACY = 1e-10  # of HiGHS, the least that it takes, with rows of numbers of at most 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,6 +34,7 @@ class SumOfMinima:
       equal: [E, K].
       penalty: lambda. largest: M.
       nonnegative: whether weights may not be negative. is_floored: whether minima may not be.
+      slack: eps, as a share of the largest number of the rows times M.
     """
 
     rows: Float[np.ndarray, "J K"]
@@ -42,6 +44,7 @@ class SumOfMinima:
     largest: float
     nonnegative: bool
     is_floored: bool
+    slack: float = 0.0
 
     def value(self, weights: Float[np.ndarray, " K"]) -> float:
         """What weights reach, whether or not they keep to the constraints."""
@@ -68,45 +71,48 @@ class SumOfMinima:
         signs = (1.0,) if self.nonnegative else (1.0, -1.0)
         numbers = (np.arange(len(self.rows)), self.groups)
         of_group = scipy.sparse.csr_array((np.ones(len(self.rows)), numbers), shape=(len(self.rows), groups))
-        rows = scipy.sparse.hstack([*(-sign * self.rows / self.unit for sign in signs), of_group], format="csc")
-        nothing = np.zeros((len(self.equal), groups))
-        equal = np.hstack([*(sign * self.equal / self.unit for sign in signs), nothing])
+        of_group = scipy.sparse.vstack([of_group, scipy.sparse.csr_array((2 * len(self.equal), groups))])
+        linear = np.concatenate([-self.rows, self.equal, -self.equal]) / self.unit
+        rows = scipy.sparse.hstack([*(sign * linear for sign in signs), of_group], format="csc")
+        right = np.repeat([0.0, self.slack], [len(self.rows), 2 * len(self.equal)])
         # In units of M and of the largest number: what the whole objective is divided by changes no multiplier.
         cost = np.append(np.full(len(signs) * count, self.penalty / self.unit), np.full(groups, -1.0))
-        bounds = [(0.0, 1.0)] * (len(signs) * count) + [(0.0 if self.is_floored else None, None)] * groups
-        result = _highs(cost, rows, equal, bounds)
+        bounds = [(0.0, 1.0)] * (len(signs) * count) + [(-self.slack if self.is_floored else None, None)] * groups
+        result = _highs(cost, rows, right, bounds)
         if result.x is None:
-            return np.zeros(count), self._bound(np.zeros(len(self.rows)), np.zeros(len(self.equal)))
+            return np.zeros(count), self._bound(np.zeros(len(right)))
         parts = result.x[: len(cost) - groups].reshape(len(signs), count)
         weights = self.largest * np.clip(np.array(signs) @ parts, 0.0 if self.nonnegative else -1.0, 1.0)
-        return weights, self._bound(np.maximum(-result.ineqlin.marginals, 0.0), result.eqlin.marginals)
+        return weights, self._bound(np.maximum(-result.ineqlin.marginals, 0.0))
 
-    def _bound(self, multipliers: Float[np.ndarray, " J"], free: Float[np.ndarray, " E"]) -> float:
-        """What multipliers prove, brought to the sums that they need."""
-        total = np.bincount(self.groups, multipliers, self._num_groups)[self.groups]
+    def _bound(self, multipliers: Float[np.ndarray, " N"]) -> float:
+        """What multipliers of the rows, of E w <= eps and of -E w <= eps prove, brought to the sums that they need."""
+        of_rows, above, below = np.split(multipliers, len(self.rows) + np.array([0, len(self.equal)]))
+        total = np.bincount(self.groups, of_rows, self._num_groups)[self.groups]
         sizes = np.bincount(self.groups, minlength=self._num_groups)[self.groups]
-        share = np.where(total > 0, multipliers / np.where(total > 0, total, 1.0), 1.0 / sizes)
+        share = np.where(total > 0, of_rows / np.where(total > 0, total, 1.0), 1.0 / sizes)
         if self.is_floored:
-            share = np.where(total >= 1.0, multipliers, share)
-        slope = self.rows.T @ share + self.equal.T @ free
+            share = np.where(total >= 1.0, of_rows, share)
+        slope = self.rows.T @ share + self.equal.T @ (below - above)
         slope = slope if self.nonnegative else np.abs(slope)
-        return self.largest * float(np.maximum(slope - self.penalty, 0.0).sum())
+        extra = max(0.0, share.sum() - self._num_groups) + above.sum() + below.sum()
+        proved = self.largest * np.maximum(slope - self.penalty, 0.0).sum()
+        return float(proved + self.slack * self.unit * self.largest * extra)
 
     @property
     def _num_groups(self) -> int:
         return int(self.groups.max(initial=-1)) + 1
 
 
-def _highs(cost, rows, equal, bounds):
-    """min cost . x over rows x <= 0, equal x = 0 and bounds."""
+def _highs(cost, rows, right, bounds):
+    """min cost . x over rows x <= right and bounds."""
     from scipy.optimize import linprog  # takes as long to import as much of the library, and few calls need it
 
+    has_rows = rows.shape[0] > 0
     return linprog(
         cost,
-        A_ub=rows if rows.shape[0] else None,
-        b_ub=np.zeros(rows.shape[0]) if rows.shape[0] else None,
-        A_eq=equal if equal.shape[0] else None,
-        b_eq=np.zeros(equal.shape[0]) if equal.shape[0] else None,
+        A_ub=rows if has_rows else None,
+        b_ub=right if has_rows else None,
         bounds=bounds,
         method="highs",
         options={"primal_feasibility_tolerance": _ACCURACY, "dual_feasibility_tolerance": _ACCURACY},

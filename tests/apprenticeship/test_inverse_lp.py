@@ -165,6 +165,15 @@ def test_the_expert_of_a_gridworld():
     np.testing.assert_allclose(by_state.objective, learned.objective, rtol=0, atol=1e-6)
 
 
+def test_ties_up_to_rounding_leave_the_rewards_that_there_are():
+    """On the racetrack only one ratio of the two rewards explains the expert: constraints met exactly leave none."""
+    mdp = jaxhom.racetrack("a").mdp
+    expert = jaxhom.optimal_policy(mdp, np.asarray(mdp.features) @ np.array([5.0, 200.0]))
+    learned = inverse_lp(mdp, expert)
+    assert learned.status == Status.SOLVED and learned.objective > 100
+    np.testing.assert_allclose(learned.weights[0] / learned.weights[1], 5 / 200, rtol=0.02)
+
+
 # ---------------------------------------------------------------------------------------- demonstrations
 
 

@@ -9,7 +9,8 @@ import oracles
 import pytest
 import small_models
 
-from jaxhom import MDP, Demonstrations, Status, gridworld, monte_carlo_feature_expectations, projection
+from jaxhom import MDP, Demonstrations, Status, gridworld, monte_carlo_feature_expectations, mwal, projection
+from jaxhom.apprenticeship import exact
 from jaxhom.solvers.nearest_point import nearest_mixture
 
 METHODS = ["projection", "max_margin"]
@@ -89,7 +90,7 @@ def test_the_margin_method_ends_at_the_optimum():
     learned = projection(mdp, expectations, method="max_margin", tolerance=1e-9)
     assert learned.status == Status.SOLVED and learned.iterations <= 20
     np.testing.assert_allclose(learned.objective, oracles.least_distance(points, expectations), rtol=0, atol=1e-8)
-    slow = projection(mdp, expectations, tolerance=1e-9, max_iterations=30)
+    slow = projection(mdp, expectations, method="projection", tolerance=1e-9, max_iterations=30)
     assert slow.status == Status.ITERATION_LIMIT and slow.iterations == 30
     assert_certified(slow, mdp, expectations)
 
@@ -200,6 +201,18 @@ def test_a_tolerance_that_rounding_does_not_allow():
     learned = projection(mdp, [3.0, 3.0, 3.0], method="max_margin", tolerance=1e-12)
     assert learned.status == Status.STALLED
     assert learned.bound <= learned.objective
+
+
+@pytest.mark.parametrize("learner", [projection, mwal])
+def test_models_that_are_too_wide_for_lu(learner, monkeypatch):
+    """They are planned for and evaluated by programs, and say the same."""
+    mdp = random_model(6)
+    by_lu = learner(mdp, [5.0, 4.0, 6.0], tolerance=0.05)
+    monkeypatch.setattr(exact.Exact, "is_direct", False)
+    by_program = learner(mdp, [5.0, 4.0, 6.0], tolerance=0.05)
+    assert by_lu.status == by_program.status == Status.SOLVED
+    np.testing.assert_allclose(by_program.objective, by_lu.objective, rtol=0, atol=0.05)
+    np.testing.assert_allclose(by_program.bound, by_lu.bound, rtol=0, atol=0.05)
 
 
 def test_nearest_mixtures(rng):

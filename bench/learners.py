@@ -18,7 +18,7 @@ from bench.problems import Problem
 from bench.relations import nothing_fed
 from jaxhom import MDP, Demonstrations
 
-_ROUNDS = 500  # of projection and MWAL
+_ROUNDS = 100  # of projection and MWAL
 
 
 def uniform(problem: Problem) -> Learned:
@@ -42,11 +42,15 @@ def learned(learn: Callable[[MDP, Demonstrations], jaxhom.Learned], *, is_greedy
     """A method that learns from demonstrations draw by draw: the greedy policy of the weights, or the theory's."""
 
     def method(problem: Problem) -> Learned:
-        mdp = problem.domain.mdp
-        found = [learn(mdp, shown) for shown in problem.demonstrations]
-        return _of(found, is_greedy)
+        return _of(problem.once(_each(learn)), is_greedy)
 
     return method
+
+
+@functools.cache
+def _each(learn: Callable) -> Callable[[Problem], list[jaxhom.Learned]]:
+    """What is learned from the demonstrations of each draw."""
+    return lambda problem: [learn(problem.domain.mdp, shown) for shown in problem.demonstrations]
 
 
 def learned_from(source: Method | None, learn: Callable, *, is_greedy: bool = False) -> Method:

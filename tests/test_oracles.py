@@ -372,6 +372,30 @@ def test_lpal_is_zero_where_features_are_a_partition(rng):
 # --------------------------------------------------------------------------------- evaluation
 
 
+def test_distances_from_hulls():
+    square = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0]])
+    for target, distance in (([1.0, 1.0], 0.0), ([3.0, 1.0], 1.0), ([3.0, 3.0], np.sqrt(2)), ([2.0, 2.0], 0.0)):
+        np.testing.assert_allclose(oracles.least_distance(square, np.array(target)), distance, rtol=0, atol=1e-7)
+
+
+def test_all_expectations_hold_the_best(rng):
+    transition, discount, initial, features = oracles.random_mdp(rng, 4, 2, K=3)
+    points, weights = oracles.all_expectations(transition, discount, initial, features), rng.normal(size=3)
+    best = initial @ oracles.optimal_value(transition, discount, features @ weights)[0]
+    assert points.shape == (16, 3)
+    np.testing.assert_allclose((points @ weights).max(), best)
+
+
+def test_inverse_programs_by_hand():
+    """Two states; to stay in 1 for ever is best. Reward (-1, 1) makes the other way cost the most."""
+    transition = np.eye(2)[[[0, 1], [0, 1]]]
+    found, reward = oracles.inverse_lp_from_policy(transition, 0.5, np.array([1, 1]), np.eye(2), 0.0, 1.0)
+    np.testing.assert_allclose(reward, [-1.0, 1.0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found, 2 * 0.5 * 2.0)  # in both states V(1) - V(0) = 2, half of it a step later
+    met = np.array([[0.0, 1.0], [1.0, 0.0]])  # ahead by (1, -1) and (0, 0)
+    np.testing.assert_allclose(oracles.inverse_lp_from_expectations(np.array([1.0, 0.0]), met, 1.0), 2.0)
+
+
 def test_evaluation_of_a_chain_stops_at_its_end():
     transition, policy, initial = chain(4), np.ones((4, 1)), np.array([0.5, 0, 0.5, 0])
     reward = np.array([[1.0], [2.0], [10.0], [100.0]])

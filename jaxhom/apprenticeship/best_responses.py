@@ -8,7 +8,7 @@ that has it. What is returned is evaluated anew, from the policy and the weights
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features, checked_expectations
 from jaxhom.apprenticeship.certificate import ExactSides
-from jaxhom.apprenticeship.exact import exact_rows
+from jaxhom.apprenticeship.exact import exact_rows, rounded_down
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.presolve import Reach
@@ -87,14 +87,29 @@ class Responder:
         return np.asarray(occupancy(self._mdp, policy), np.float64).sum(axis=1)
 
 
+class Proposal(NamedTuple):
+    """What the rounds of a lane have found; nothing of it certified.
+
+    Attributes:
+      x: [S, A], the mixture's occupancy.
+      weights: [K]. value: [S], a guess of the best values for them.
+      iterations: best responses.
+      status: how the rounds ended.
+    """
+
+    x: Float[np.ndarray, "S A"]
+    weights: Float[np.ndarray, " K"]
+    value: Float[np.ndarray, " S"]
+    iterations: int
+    status: Status
+
+
 class Outcome:
     """What a lane returns, evaluated: the policy of a mixture, and what its weights prove.
 
     Args:
       sides: the model.
-      x: [S, A], the mixture's occupancy.
-      weights: [K], as the learner has them.
-      value: [S], a guess of the best values for them.
+      proposal: of the lane.
       expectations: [K], as the caller gave them. tolerance: of the lane.
 
     Attributes:
@@ -105,29 +120,32 @@ class Outcome:
       advantage: scalar, no policy's weights . (V - expectations) is larger.
     """
 
-    def __init__(self, sides: ExactSides, x, weights, value, expectations, tolerance: float):
-        dtype, error = np.dtype(sides.mdp.dtype), _DIGITS * tolerance
-        self.weights = weights.astype(dtype)
-        self.advantage, actions = sides.advantage(self.weights.astype(np.float64), expectations, value, error)
+    def __init__(self, sides: ExactSides, proposal: Proposal, expectations: Float[np.ndarray, " K"], tolerance: float):
+        dtype, error, x = np.dtype(sides.mdp.dtype), _DIGITS * tolerance, proposal.x
+        self._proposal, self._tolerance = proposal, tolerance
+        self.weights = proposal.weights.astype(dtype)
+        self.advantage, actions = sides.advantage(self.weights.astype(np.float64), expectations, proposal.value, error)
         best = np.eye(x.shape[1])[actions]
         self.greedy_policy = best.astype(dtype)
         self.policy = exact_rows(policy_from_occupancy(sides.mdp, x, best, _NO_OCCUPANCY), dtype)
         self.low, self.high = sides.expected(self.policy, error)
 
-    def learned(
-        self, objective: np.ndarray, bound: np.ndarray, iterations: int, status: Status, is_closed: bool
-    ) -> Learned:
-        """The record of the lane. `status`: how the rounds ended; `is_closed`: whether the certificate agrees."""
-        dtype = self.policy.dtype
-        stopped = Status.STALLED if status == Status.SOLVED else status
+    def learned(self, objective: float, bound: float, *, is_above: bool) -> Learned:
+        """The record of the lane. `is_above`: whether the objective is to come down to the bound, or up."""
+        dtype, stopped = self.policy.dtype, self._proposal.status
+        high, low = (objective, bound) if is_above else (bound, objective)
+        high, low = -rounded_down(-high, dtype), rounded_down(low, dtype)
+        is_closed = float(high) - float(low) <= self._tolerance
+        if stopped == Status.SOLVED:
+            stopped = Status.STALLED  # unless what is returned agrees
         return Learned(
             policy=self.policy,
             greedy_policy=self.greedy_policy,
             weights=self.weights,
             expectations=(0.5 * (self.low + self.high)).astype(dtype),
-            objective=objective,
-            bound=bound,
-            iterations=np.int32(iterations),
+            objective=high if is_above else low,
+            bound=low if is_above else high,
+            iterations=np.int32(self._proposal.iterations),
             status=np.int32(Status.SOLVED if is_closed else stopped),
         )
 

@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.best_responses import Outcome, Responder, goal_of, mixture, solve_lanes
+from jaxhom.apprenticeship.best_responses import Outcome, Proposal, Responder, goal_of, mixture, solve_lanes
 from jaxhom.apprenticeship.certificate import ExactSides, simplex_point
-from jaxhom.apprenticeship.exact import rounded_down
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.presolve import Reach, reduce_expectations
 from jaxhom.models.mdp import MDP
@@ -101,8 +100,8 @@ def mwal(
     limit = checks.require_count("max_iterations", max_iterations)
 
     def solve(sides, reach, expectations, tolerance):
-        found = _rounds(sides, reach, expectations, goal_of(sides.mdp, tolerance), limit)
-        return _certified(sides, expectations, tolerance, found)
+        proposal = _rounds(sides, reach, expectations, goal_of(sides.mdp, tolerance), limit)
+        return _certified(sides, expectations, tolerance, proposal)
 
     return solve_lanes("mwal", mdp, expectations, tolerance, _default_tolerance, solve)
 
@@ -124,19 +123,9 @@ class _Best:
             self.weights, self.bound = weights, bound
 
 
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    """What the rounds of a lane have found: the average occupancy [S, A], weights [K] and values [S] for them, rounds,
-    the end."""
-
-    x: Float[np.ndarray, "S A"]
-    weights: Float[np.ndarray, " K"]
-    value: Float[np.ndarray, " S"]
-    iterations: int
-    status: Status
-
-
-def _rounds(sides: ExactSides, reach: Reach, expectations: Float[np.ndarray, " K"], goal: float, limit: int) -> _Found:
+def _rounds(
+    sides: ExactSides, reach: Reach, expectations: Float[np.ndarray, " K"], goal: float, limit: int
+) -> Proposal:
     """Rounds of weights and best responses, until the average policy's margin is within the goal of the bound."""
     plays = ~reduce_expectations(reach, expectations[None]).is_idle[0]
     wanted = expectations[plays]
@@ -167,17 +156,15 @@ def _rounds(sides: ExactSides, reach: Reach, expectations: Float[np.ndarray, " K
         status = Status.SOLVED if best.bound - margin <= goal else status
     weights = np.zeros(len(plays))
     weights[plays] = simplex_point(best.weights)
-    return _Found(mixture(responder.pool, counts / count), weights, responder.guess(weights), count, status)
+    return Proposal(mixture(responder.pool, counts / count), weights, responder.guess(weights), count, status)
 
 
-def _certified(sides: ExactSides, expectations: Float[np.ndarray, " K"], tolerance: float, found: _Found) -> Learned:
-    outcome = Outcome(sides, found.x, found.weights, found.value, expectations, tolerance)
-    dtype, eps = outcome.policy.dtype, np.finfo(float).eps
+def _certified(
+    sides: ExactSides, expectations: Float[np.ndarray, " K"], tolerance: float, proposal: Proposal
+) -> Learned:
+    outcome, eps = Outcome(sides, proposal, expectations, tolerance), np.finfo(float).eps
     margin = (outcome.low - expectations - 2.0 * eps * (np.abs(outcome.low) + np.abs(expectations))).min()
-    weights = outcome.weights.astype(np.float64)
-    bound = outcome.advantage / weights.sum()  # in the model's type weights do not sum to 1
+    bound = outcome.advantage / outcome.weights.astype(np.float64).sum()  # 1 in float64, and nearly so in float32
     bound += 8.0 * eps * abs(bound)
-    objective = rounded_down(min(margin, bound), dtype)
-    bound = -rounded_down(-max(margin, bound), dtype)
-    is_closed = float(bound) - float(objective) <= tolerance
-    return outcome.learned(objective, bound, found.iterations, found.status, is_closed)
+    # Bounds that rounding has made to cross are both uncertain.
+    return outcome.learned(min(margin, bound), max(margin, bound), is_above=False)

@@ -15,16 +15,14 @@ The right side is the certificate: any w gives min_pi w . (Vhat - V(pi)) / |w|_2
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.best_responses import Outcome, Responder, goal_of, mixture, solve_lanes
+from jaxhom.apprenticeship.best_responses import Outcome, Proposal, Responder, goal_of, mixture, solve_lanes
 from jaxhom.apprenticeship.certificate import ExactSides
-from jaxhom.apprenticeship.exact import rounded_down
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.presolve import Reach
 from jaxhom.models.mdp import MDP, uniform_policy
@@ -101,8 +99,8 @@ def projection(
     limit = checks.require_count("max_iterations", max_iterations)
 
     def solve(sides, reach, expectations, tolerance):
-        found = _rounds(sides, expectations, goal_of(sides.mdp, tolerance), limit, _METHODS[method])
-        return _certified(sides, expectations, tolerance, found)
+        proposal = _rounds(sides, expectations, goal_of(sides.mdp, tolerance), limit, _METHODS[method])
+        return _certified(sides, expectations, tolerance, proposal)
 
     return solve_lanes("projection", mdp, expectations, tolerance, _default_tolerance, solve)
 
@@ -129,19 +127,7 @@ def _nearest_of_all(points: Float[np.ndarray, "M K"], shares: Float[np.ndarray, 
 _METHODS: dict[str, Mix] = {"projection": _step_towards, "max_margin": _nearest_of_all}
 
 
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    """What the rounds of a lane have found: the mixture's occupancy [S, A], weights [K] and values [S] for them, best
-    responses, the end."""
-
-    x: Float[np.ndarray, "S A"]
-    weights: Float[np.ndarray, " K"]
-    value: Float[np.ndarray, " S"]
-    iterations: int
-    status: Status
-
-
-def _rounds(sides: ExactSides, expectations: Float[np.ndarray, " K"], goal: float, limit: int, mix: Mix) -> _Found:
+def _rounds(sides: ExactSides, expectations: Float[np.ndarray, " K"], goal: float, limit: int, mix: Mix) -> Proposal:
     """Best responses to the direction from the mixture to the expectations, until the gap is below the goal."""
     responder = Responder(sides, goal)
     responder.add(np.asarray(uniform_policy(sides.mdp), np.float64))
@@ -165,17 +151,16 @@ def _rounds(sides: ExactSides, expectations: Float[np.ndarray, " K"], goal: floa
             status = Status.SOLVED
         elif not after < before:  # the best response is no nearer: rounding has the last word
             status = Status.STALLED
-    return _Found(mixture(responder.pool, shares), weights, responder.guess(weights), iterations, status)
+    return Proposal(mixture(responder.pool, shares), weights, responder.guess(weights), iterations, status)
 
 
-def _certified(sides: ExactSides, expectations: Float[np.ndarray, " K"], tolerance: float, found: _Found) -> Learned:
-    outcome = Outcome(sides, found.x, found.weights, found.value, expectations, tolerance)
-    dtype, eps = outcome.policy.dtype, np.finfo(float).eps
+def _certified(
+    sides: ExactSides, expectations: Float[np.ndarray, " K"], tolerance: float, proposal: Proposal
+) -> Learned:
+    outcome, eps = Outcome(sides, proposal, expectations, tolerance), np.finfo(float).eps
     farthest = np.maximum(np.abs(expectations - outcome.low), np.abs(expectations - outcome.high))
     length = np.linalg.norm(outcome.weights.astype(np.float64))
     rounding = 1.0 + (len(expectations) + 8) * eps
-    distance = np.linalg.norm(farthest) * rounding + eps * np.abs(expectations).max()
+    distance = float(np.linalg.norm(farthest) * rounding + eps * np.abs(expectations).max())
     bound = max(0.0, -outcome.advantage / (length * rounding)) if length > 0 else 0.0
-    objective, bound = -rounded_down(-distance, dtype), rounded_down(min(bound, distance), dtype)
-    is_closed = float(objective) - float(bound) <= tolerance
-    return outcome.learned(objective, bound, found.iterations, found.status, is_closed)
+    return outcome.learned(distance, min(bound, distance), is_above=True)

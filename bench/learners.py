@@ -72,7 +72,7 @@ def inverse_lp_of_policies(source: Method) -> Method:
 
     def method(problem: Problem) -> Learned:
         mdp = problem.domain.mdp
-        return _of([jaxhom.inverse_lp(mdp, policy, l1=1e-3) for policy in problem.once(source).policy], True)
+        return _of([jaxhom.inverse_lp(mdp, policy, nonnegative=True) for policy in problem.once(source).policy], True)
 
     return method
 
@@ -88,6 +88,7 @@ def _by_expectations(mdp: MDP, expectations) -> jaxhom.Learned:
 
 _projection = functools.partial(jaxhom.projection, max_iterations=_ROUNDS)
 _mwal = functools.partial(jaxhom.mwal, max_iterations=_ROUNDS)
+_inverse_lp = functools.partial(jaxhom.inverse_lp, nonnegative=True)
 
 CONTROLS: dict[str, Method] = {
     "uniform": uniform,
@@ -110,7 +111,7 @@ LEARNERS: dict[str, Method] = {
     "projection, Monte Carlo": learned_from(None, _projection),
     "MWAL, Algorithm 1": learned_from(soft, _mwal),
     "MWAL, Monte Carlo": learned_from(None, _mwal),
-    "inverse LP": learned(jaxhom.inverse_lp),
+    "inverse LP": learned(_inverse_lp),
     "inverse LP, Algorithm 1": inverse_lp_of_policies(soft),
 }
 """Fed with demonstrations, or with the expectations of what stands behind the comma."""

@@ -27,6 +27,7 @@ from jaxhom.generalization.soft_homomorphism import soft_homomorphism
 from jaxhom.generalization.uniform import maximum_entropy, uniform_elsewhere
 from jaxhom.guarantees.loss_bound import LossBound, loss_bound
 from jaxhom.guarantees.queries import Queries, query_states
+from jaxhom.guarantees.robust_policy import RobustPolicy, robust_policy
 from jaxhom.models.demonstrations import (
     Demonstrations,
     empirical_policy,
@@ -67,6 +68,7 @@ __all__ = [
     "Plan",
     "Queries",
     "Racetrack",
+    "RobustPolicy",
     "SimilarityTable",
     "SoftHomomorphism",
     "Status",
@@ -94,6 +96,7 @@ __all__ = [
     "policy_value",
     "query_states",
     "racetrack",
+    "robust_policy",
     "sample_demonstrations",
     "sample_weights",
     "soft_homomorphism",

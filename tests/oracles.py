@@ -561,6 +561,66 @@ def finite_horizon_evaluation(transition, initial, policy, reward, horizon, term
     return {"steps": float(steps), **per_step}
 
 
+# --------------------------------------------------------------------------------- guarantees
+
+
+def agreeing_policies(policy, agreed, allowed=None):
+    """All policies [P, S, A] that are as `policy` on the states `agreed` (bool [S]) and deterministic elsewhere."""
+    num_states, num_actions = policy.shape
+    allowed = np.ones(policy.shape, dtype=bool) if allowed is None else allowed
+    options = [[policy[s]] if agreed[s] else list(np.eye(num_actions)[allowed[s]]) for s in range(num_states)]
+    return np.array(list(itertools.product(*options)))
+
+
+def expectations_of_policies(transition, discount, initial, features, policies):
+    """Feature expectations [P, K] of policies [P, S, A], by dense solves."""
+    step = np.einsum("psa,sat->pst", policies, transition)
+    reward = np.einsum("psa,sak->psk", policies, features)
+    values = np.linalg.solve(np.eye(len(initial)) - discount * step, reward)
+    return np.einsum("s,psk->pk", initial, values)
+
+
+def best_agreeing(transition, discount, initial, features, policy, agreed, allowed=None):
+    """U [K] over the policies of `agreeing_policies`, and for each feature the one that attains it, [K, S, A].
+
+    A stationary policy that is random elsewhere is worth no more than the best of those: it is a decision problem.
+    """
+    policies = agreeing_policies(policy, agreed, allowed)
+    worth = expectations_of_policies(transition, discount, initial, features, policies)
+    return worth.max(axis=0), policies[worth.argmax(axis=0)]
+
+
+def loss_by_states(transition, discount, initial, reward, better, policy):
+    """[S]: mu(s) sum_a better(s, a) A(s, a), with mu of `better` and the advantages A = Q - V of `policy`."""
+    value = policy_value(transition, discount, policy, reward)
+    advantage = reward + discount * transition @ value - value[:, None]
+    return (occupancy(transition, discount, initial, better) * advantage).sum(axis=1)
+
+
+def steps_of_policies(transition, discount, initial, reward, policies):
+    """sum_{t < H} discount^t E r of a sequence of H policies [S, A]."""
+    total, distribution = 0.0, initial
+    for t, policy in enumerate(policies):
+        taken = distribution[:, None] * policy
+        total += discount**t * np.sum(taken * reward)
+        distribution = np.einsum("sa,sat->t", taken, transition)
+    return total
+
+
+def best_agreeing_steps(transition, discount, initial, features, policy, agreed, horizon):
+    """U [K] over the first `horizon` steps, by backward induction with every state's choice written out."""
+    best = np.zeros(features.shape[2])
+    for k in range(len(best)):
+        value = np.zeros(len(initial))
+        for _ in range(horizon):
+            action_value = features[:, :, k] + discount * transition @ value
+            value = np.array(
+                [row @ q if fixed else q.max() for row, q, fixed in zip(policy, action_value, agreed, strict=True)]
+            )
+        best[k] = initial @ value
+    return best
+
+
 # ------------------------------------------------------------------------------- small models
 
 

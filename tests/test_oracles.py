@@ -398,6 +398,37 @@ def test_evaluation_agrees_with_sampling(rng):
     assert abs(np.mean(samples) - result["reward_per_step"]) < 4 * standard_error
 
 
+# --------------------------------------------------------------------------------- guarantees
+
+
+def test_agreeing_policies_of_two_states():
+    """State 0 is fixed: it stays half the time. State 1 may go back or stay, which pays 1 a step."""
+    transition = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, 1.0]]])
+    features, initial = np.array([[[0.0], [0.0]], [[0.0], [1.0]]]), np.array([1.0, 0.0])
+    policy, agreed = np.full((2, 2), 0.5), np.array([True, False])
+    policies = oracles.agreeing_policies(policy, agreed)
+    np.testing.assert_array_equal(policies, [[[0.5, 0.5], [1.0, 0.0]], [[0.5, 0.5], [0.0, 1.0]]])
+    best, attained = oracles.best_agreeing(transition, 0.5, initial, features, policy, agreed)
+    # V(1) = 2, V(0) = 0.25 V(0) + 0.25 * 2
+    assert best == pytest.approx([2 / 3])
+    np.testing.assert_array_equal(attained[0], policies[1])
+    # the first step ends in state 1 with probability 1/2, and the second pays
+    found = oracles.best_agreeing_steps(transition, 0.5, initial, features, policy, agreed, 2)
+    assert found == pytest.approx([0.25])
+    assert oracles.steps_of_policies(transition, 0.5, initial, features[..., 0], policies[[0, 1]]) == 0.25
+
+
+def test_losses_by_states_add_up(rng):
+    transition, discount, initial, features = oracles.random_mdp(rng, 5, 2)
+    better, policy = rng.dirichlet(np.ones(2), size=(2, 5))
+    worth = oracles.expectations_of_policies(transition, discount, initial, features, np.array([better, policy]))
+    for k in range(3):
+        parts = oracles.loss_by_states(transition, discount, initial, features[..., k], better, policy)
+        assert parts.sum() == pytest.approx(worth[0, k] - worth[1, k])
+        expected = oracles.feature_expectations(transition, discount, initial, features, policy)[k]
+        assert worth[1, k] == pytest.approx(expected)
+
+
 # ------------------------------------------------------------------------------- small models
 
 

@@ -173,6 +173,9 @@ def cases() -> dict[str, Case]:
         "lpal": Case(lambda vhat: jaxhom.lpal(mdp, vhat), vhat, **margins),
         "LPAL.solve": Case(jaxhom.LPAL(mdp).solve, vhat, **margins),
         "loss_bound": Case(lambda policy: jaxhom.loss_bound(mdp, walks, policy).bound, policy),
+        "robust_policy": Case(
+            lambda scale: jaxhom.robust_policy(mdp.replace(features=scale * mdp.features), walks).policy, one
+        ),
         "SimilarityTable": Case(
             lambda discount: jaxhom.SimilarityTable(mdp.replace(probability=mdp.probability * (discount / discount))),
             half,

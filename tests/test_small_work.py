@@ -91,6 +91,7 @@ STEPS = {
     ),
     "loss_bound, a batch": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, np.stack([policy, policy])),
     "loss_bound, first steps": lambda mdp, policy: jaxhom.loss_bound(mdp, DEMONSTRATIONS, policy, horizon=7),
+    "robust_policy": lambda mdp, policy: jaxhom.robust_policy(mdp, DEMONSTRATIONS),
     "lpal of two": lambda mdp, policy: jaxhom.lpal(mdp, np.array([3.0, 4.0])[:, None] + np.zeros(FEATURES)),
 }
 MODELS = {

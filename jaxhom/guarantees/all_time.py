@@ -22,14 +22,14 @@ from jaxhom.planning import policy_iteration
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 _EPS = float(np.finfo(np.float64).eps)
-_SWEEPS = 100  # before linear systems are solved, where that is quick
-_MOST_SWEEPS = 10_000  # where it is not: their error falls by gamma with each, and faster where the graph mixes
+_SWEEPS = 100  # before linear systems are solved, where that is quick; where it is not, as long as the span falls
+_SLOW, _MOST_SWEEPS = 0.5, 10_000  # to half of what it was after so many
 _DIRECT = 1e7  # states times bandwidth up to which a direct solve takes less than hundreds of sweeps
-_TOLERANCE = 1e-11  # of what b may span, as a share of the largest |feature|
-_KRYLOV_STEPS, _KRYLOV_RESIDUAL = 1000, 1e-13
+_TOLERANCE, _ROUNDINGS = 1e-12, 8.0  # of what b may span: a share of the largest |feature|, and roundings of |V|
+_KRYLOV_STEPS, _KRYLOV_RESIDUAL, _KRYLOV_ERROR = 500, 1e-13, 1e-9  # what is asked for, and what is good enough
 
 
 def best(choices: Choices) -> Found:
@@ -48,17 +48,27 @@ def best(choices: Choices) -> Found:
 
 def of_policy(choices: Choices) -> Found:
     """The values of a policy, of choices in which every state is fixed."""
-    actions, states = choices.first, np.arange(len(choices.first))
-    value = _solved(choices, actions, choices.reward[states, actions], is_flow=False)
-    return _found(choices, value, np.broadcast_to(actions[:, None], value.shape), Status.SOLVED)
+    actions = choices.first
+    value = _solved(choices, actions, choices.own_reward, is_flow=False)
+    status = Status.SOLVED if np.isfinite(value).all() else Status.STALLED
+    return _found(choices, np.nan_to_num(value), np.broadcast_to(actions[:, None], value.shape), status)
 
 
-def contributions(choices: Choices, best: Found, own: Found, k: int) -> Float[np.ndarray, " S"]:
-    """What every state adds to the loss of a policy of values `own` against the best choices for feature k."""
-    actions = best.actions[:, k]
-    mu = np.maximum(_solved(choices, actions, choices.initial[:, None], is_flow=True)[:, 0], 0.0)
-    action_value = choices.backup(own.values[:, [k]], [k])[..., 0]
-    return mu * (action_value[np.arange(len(mu)), actions] - own.values[:, k])
+def contributions(choices: Choices, best: Found, own: Found, share: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
+    """What every state adds to the loss of a policy against the best choices.
+
+    Args:
+      choices: what can be chosen. best: what was found for them.
+      own: of the policy.
+      share: [K], how much each feature counts.
+    """
+    states, total = np.arange(len(choices.initial)), np.zeros(len(choices.initial))
+    for k in np.flatnonzero(share):
+        actions = best.actions[:, k]
+        mu = _solved(choices, actions, choices.initial[:, None], is_flow=True)[:, 0]
+        reached = choices.backup(own.values[:, [k]], [k])[states, actions, 0]
+        total += share[k] * np.maximum(np.nan_to_num(mu), 0.0) * (reached - own.values[:, k])
+    return total
 
 
 def _found(choices: Choices, value, actions, status: int) -> Found:
@@ -68,19 +78,22 @@ def _found(choices: Choices, value, actions, status: int) -> Found:
     return Found(lower, upper, value, actions, int(status))
 
 
-def _swept(choices: Choices) -> tuple[Float[np.ndarray, "S K"], np.ndarray]:
+def _swept(choices: Choices) -> tuple[Float[np.ndarray, "S K"], Bool[np.ndarray, " K"]]:
     """Values after sweeps, shifted by the constant that halves what is open, and which features are still open."""
-    sweeps = _SWEEPS if _is_direct(choices) else _MOST_SWEEPS
-    value = np.zeros((len(choices.initial), len(choices.size)))
-    time = 1.0 / (1.0 - choices.discount)
-    for _ in range(sweeps):
+    value, former = np.zeros((len(choices.initial), len(choices.size))), np.inf
+    shift = 0.5 * choices.discount / (1.0 - choices.discount)
+    for count in range(1, _MOST_SWEEPS + 1):
         improved = choices.backup(value, slice(None)).max(axis=1)
         change = improved - value
         low, high = change.min(axis=0), change.max(axis=0)
-        value = improved + choices.discount * time * 0.5 * (low + high)
-        is_open = high - low > _TOLERANCE * choices.size
+        value, span = improved + shift * (low + high), high - low
+        is_open = span > _TOLERANCE * choices.size + _ROUNDINGS * _EPS * np.abs(value).max(axis=0)
         if not is_open.any():
             break
+        if count % _SWEEPS == 0:
+            if _is_direct(choices) or (span > _SLOW * former)[is_open].any():
+                break
+            former = span
     return value, is_open
 
 
@@ -91,10 +104,7 @@ def _is_direct(choices: Choices) -> bool:
 
 
 def _solved(choices: Choices, actions, right: Float[np.ndarray, "S L"], *, is_flow: bool) -> Float[np.ndarray, "S L"]:
-    """Values of rewards, or occupancies of distributions, under actions [S]; zeros where nothing is found.
-
-    What is wrong with them is seen in the bounds.
-    """
+    """Values of rewards, or occupancies of distributions, under actions [S]; NaN where nothing is found."""
     model = choices.model
     found = np.full_like(right, np.nan)
     if not _is_direct(choices):
@@ -102,20 +112,22 @@ def _solved(choices: Choices, actions, right: Float[np.ndarray, "S L"], *, is_fl
     if not np.isfinite(found).all() and model.is_solvable:
         chain = model.chain(actions)
         found = chain.state_occupancy(right[:, 0])[:, None] if is_flow else chain.value(right)
-    return np.nan_to_num(found)
+    return found
 
 
 def _by_krylov(choices: Choices, actions, right, is_flow: bool) -> Float[np.ndarray, "S L"]:
     """BiCGSTAB for each right-hand side; NaN where it does not get there."""
-    matrix = choices.leads(actions)
+    matrix, discount = choices.leads(actions), choices.discount
     matrix = matrix.T if is_flow else matrix
-    shape, discount = matrix.shape, choices.discount
-    system = scipy.sparse.linalg.LinearOperator(shape, lambda v: v - discount * (matrix @ v), dtype=float)
+    system = scipy.sparse.linalg.LinearOperator(matrix.shape, lambda v: v - discount * (matrix @ v), dtype=float)
     options = {"rtol": _KRYLOV_RESIDUAL, "atol": 0.0, "maxiter": _KRYLOV_STEPS}
+    # |(I - gamma P)^-1| is 1 / (1 - gamma) in the norm of sums for flows, and in that of maxima for values.
+    order = 1 if is_flow else np.inf
     found = np.full_like(right, np.nan)
     for lane, one in enumerate(right.T):
         with np.errstate(all="ignore"):
-            solution, flag = scipy.sparse.linalg.bicgstab(system, one, **options)
-        if flag == 0:
+            solution = scipy.sparse.linalg.bicgstab(system, one, x0=one / (1.0 - discount), **options)[0]
+            missing = np.linalg.norm(one - system @ solution, order) / (1.0 - discount)
+        if missing <= _KRYLOV_ERROR * np.linalg.norm(solution, order):
             found[:, lane] = solution
     return found

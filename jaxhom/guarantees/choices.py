@@ -51,6 +51,7 @@ class Choices:
       reward: [S, A, K], the features; -inf where an action cannot be taken.
       size: [K], the largest |feature| that can be met.
       first: int [S], in fixed states the action that stands for the row; elsewhere the first that is allowed.
+      is_one: whether every state is fixed. own_reward: [S, K], the features under `first`.
     """
 
     def __init__(self, mdp: MDP, is_fixed: Bool[np.ndarray, " S"], policy: Float[np.ndarray, "S A"]) -> None:
@@ -70,6 +71,7 @@ class Choices:
         features = features.reshape(*pairs, -1)
         self.size = np.abs(np.where(is_left[..., None], features, 0.0)).max(axis=(0, 1))
         self.reward = np.where(is_left[..., None], features, -np.inf)
+        self.is_one, self.own_reward = bool(is_fixed.all()), features[np.arange(pairs[0]), self.first]
         # By how much rows may miss what they should be: those of the model, and those that are fixed.
         stored = np.asarray(mdp.probability).sum(axis=-1, dtype=np.float64)
         self._missed_rows = float(np.abs(stored - 1.0)[allowed].max())
@@ -82,8 +84,18 @@ class Choices:
 
     def backup(self, value: Float[np.ndarray, "S L"], features: slice | list[int]) -> Float[np.ndarray, "S A L"]:
         """phi' + gamma T' V of some features; -inf where an action cannot be taken."""
-        expected = (self.model.rows @ value).reshape(*self.reward.shape[:2], -1)
-        return self.reward[..., features] + self.discount * expected
+        action_value = (self.model.rows @ value).reshape(*self.reward.shape[:2], -1)
+        action_value *= self.discount  # in place: arrays of millions of numbers
+        action_value += self.reward[..., features]
+        return action_value
+
+    def push(
+        self, distribution: Float[np.ndarray, "S L"], actions: Int[np.ndarray, "S 1 L"]
+    ) -> Float[np.ndarray, "S L"]:
+        """Where distributions of states are one step later, each under actions of its own."""
+        pairs = np.zeros((len(distribution), self.model.num_actions, distribution.shape[1]))
+        np.put_along_axis(pairs, actions, distribution[:, None], axis=1)
+        return self.model.rows.T @ pairs.reshape(-1, distribution.shape[1])
 
     def leads(self, actions: Int[np.ndarray, " S"]) -> Float[np.ndarray, "S S"] | scipy.sparse.csr_array:
         """The transitions of actions."""

@@ -21,37 +21,68 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 
+_NUMBERS_AT_A_TIME = 2**22  # values of all times that are held together
+
+
 def best(choices: Choices, horizon: int) -> Found:
     """What the best policies of the first `horizon` steps are worth; one policy's worth, if every state is fixed."""
     largest = nothing = np.zeros(len(choices.size))
     for step in _backward(choices, slice(None), horizon):
-        value, actions = step
+        value, action_value = step
         largest = np.maximum(largest, np.abs(value).max(axis=0))
     lower, upper = choices.bounds(value, (nothing, nothing), largest, horizon)
-    return Found(lower, upper, value, actions, int(Status.SOLVED))
+    return Found(lower, upper, value, _chosen(choices, action_value), int(Status.SOLVED))
 
 
-def contributions(choices: Choices, policy: Choices, k: int, horizon: int) -> Float[np.ndarray, " S"]:
-    """What every state adds, at all times together, to the loss of a policy against the best choices for feature k."""
-    states, distribution = np.arange(len(choices.initial)), choices.initial
-    actions = [actions[:, 0] for _, actions in _backward(choices, [k], horizon)]
-    values = [np.zeros((len(states), 1)), *(value for value, _ in _backward(policy, [k], horizon))]
-    total = np.zeros(len(states))
+def contributions(
+    choices: Choices, policy: Choices, share: Float[np.ndarray, " K"], horizon: int
+) -> Float[np.ndarray, " S"]:
+    """What every state adds, at all times together, to the loss of a policy against the best choices.
+
+    Args:
+      choices: what can be chosen. policy: that of the policy, in which every state is fixed.
+      share: [K], how much each feature counts.
+      horizon: H.
+    """
+    some, total = np.flatnonzero(share), np.zeros(len(choices.initial))
+    width = max(1, _NUMBERS_AT_A_TIME // (len(total) * horizon))
+    for first in range(0, len(some), width):
+        features = some[first : first + width]
+        total += _lost(choices, policy, list(features), horizon) @ share[features]
+    return total
+
+
+def _lost(choices: Choices, policy: Choices, features: list[int], horizon: int) -> Float[np.ndarray, "S L"]:
+    """The contributions for some features alone."""
+    actions = [_chosen(choices, action_value) for _, action_value in _backward(choices, features, horizon)]
+    values = [np.zeros(actions[0].shape), *(value for value, _ in _backward(policy, features, horizon))]
+    total = np.zeros(actions[0].shape)
+    distribution = np.repeat(choices.initial[:, None], len(features), axis=1)
     for time, left in enumerate(range(horizon, 0, -1)):
-        chosen = actions[left - 1]
-        lost = choices.backup(values[left - 1], [k])[states, chosen, 0] - values[left][:, 0]
-        total += choices.discount**time * distribution * lost
-        distribution = choices.leads(chosen).T @ distribution
+        chosen = actions[left - 1][:, None]
+        reached = np.take_along_axis(choices.backup(values[left - 1], features), chosen, axis=1)[:, 0]
+        total += choices.discount**time * distribution * (reached - values[left])
+        distribution = choices.push(distribution, chosen)
     return total
 
 
 def _backward(
     choices: Choices, features: slice | list[int], horizon: int
-) -> Iterator[tuple[Float[np.ndarray, "S L"], Int[np.ndarray, "S L"]]]:
-    """Values and best actions with 1, 2, ..., H steps left."""
+) -> Iterator[tuple[Float[np.ndarray, "S L"], Float[np.ndarray, "S A L"]]]:
+    """Values, and what they are the best of, with 1, 2, ..., H steps left; A = 1 where there is no choice."""
     value = np.zeros((len(choices.initial), len(choices.size[features])))
+    reward, leads = choices.own_reward[:, features], choices.leads(choices.first)
     for _ in range(horizon):
-        action_value = choices.backup(value, features)
-        actions = action_value.argmax(axis=1)
-        value = action_value.max(axis=1)
-        yield value, actions
+        if choices.is_one:
+            action_value = (reward + choices.discount * (leads @ value))[:, None]
+        else:
+            action_value = choices.backup(value, features)
+        value = action_value[:, 0] if choices.is_one else action_value.max(axis=1)
+        yield value, action_value
+
+
+def _chosen(choices: Choices, action_value: Float[np.ndarray, "S A L"]) -> Int[np.ndarray, "S L"]:
+    """The best actions."""
+    if choices.is_one:
+        return np.broadcast_to(choices.first[:, None], (len(action_value), action_value.shape[2]))
+    return action_value.argmax(axis=1)

@@ -27,7 +27,8 @@ from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, deciding_states
-from jaxhom.status import Record, summary
+from jaxhom.solvers.blas_threads import one_blas_thread
+from jaxhom.status import Record, Status
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -41,7 +42,7 @@ _AGREEMENT = 16.0  # roundings of the model's type within which two rows of a po
 class LossBound(Record):
     """How much a policy can lose; with a batch of B policies every field gains a leading axis [B].
 
-    All numbers are discounted sums, in the units of V. They hold whatever the status is. `print` says them in words.
+    All numbers are discounted sums, in the units of V. Bounds hold whatever the status is. `print` says them in words.
 
     Attributes:
       bound: scalar, no less than what the expert is worth more than the policy: for the weights that were given, or, if
@@ -51,12 +52,13 @@ class LossBound(Record):
       gaps: [K], optima - expectations: the bound for each feature as the reward.
       worst: int32 scalar, the feature of the largest gap; with weights, of the largest weighted gap.
       contributions: [S], what each state adds to the bound: how often the policy that maximises the worst feature
-        (each of the weighted features) meets the state, times how much better it does there in one step. They can be
-        negative only where rounding is, or where the policy and the expert are known to differ. They sum to the bound,
-        but for what it is rounded up by, see `loss_bound`.
+        (each of the weighted features) meets the state, times how much better its step is there than the policy's, if
+        the policy goes on afterwards. 0 in states of S^E in which the policy does what the expert does. Some can be
+        negative: steps that pay only if the better policy goes on. They sum to the bound, but for what it is rounded
+        up by, see `loss_bound`.
       agreed: bool [S], the states S^E in which the expert is known: demonstrated, and something was to be decided.
       weights: [K], as given; None if none were.
-      status: int32 scalar, a `jaxhom.Status`: SOLVED where every feature's optimum was found.
+      status: int32 scalar, a `jaxhom.Status`: SOLVED where every feature's optimum was found, and the policy's values.
     """
 
     bound: Float[Array, "*B"]
@@ -134,12 +136,8 @@ def loss_bound(
     Source: the bound is that of Syed, Bowling and Schapire 2008 for a set of experts; its parts by the performance
     difference lemma of Kakade and Langford 2002.
     """
-    mdp = as_model(mdp)
-    if checks.is_traced(mdp, demonstrations, getattr(policy, "policy", policy), weights, horizon):
-        raise ValueError("loss_bound plans on the host: call it outside jit, vmap and grad")
-    if not mdp.num_features:
-        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
-    with checks.at_once():
+    mdp = concrete_problem("loss_bound", mdp, demonstrations, getattr(policy, "policy", policy), weights, horizon)
+    with checks.at_once(), one_blas_thread():
         policy = np.asarray(check_policy(mdp, policy))
         checks.require_shape("policy", policy, "(B, S, A) with B >= 1", len(policy) > 0)
         weights = None if weights is None else _checked_weights(mdp, weights)
@@ -149,6 +147,16 @@ def loss_bound(
         return (
             lanes[0] if policy.ndim == 2 else jax.tree.map(lambda *leaves: checks.to_device(np.stack(leaves)), *lanes)
         )
+
+
+def concrete_problem(name: str, mdp: Any, *given: Any) -> MDP:
+    """The model, or `ValueError` if it has no features, or if it or what else is given to the function is traced."""
+    mdp = as_model(mdp)
+    if checks.is_traced(mdp, *given):
+        raise ValueError(f"{name} plans on the host: call it outside jit, vmap and grad")
+    if not mdp.num_features:
+        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+    return mdp
 
 
 class Agreeing:
@@ -182,9 +190,7 @@ class Agreeing:
         bound, share = weighted[worst], np.eye(len(gaps))[worst]
         if weights is not None:
             bound, share = _sum_up(weighted), weights
-        parts = np.zeros(len(policy))
-        for k in np.flatnonzero(share):
-            parts += share[k] * self._contributions(choices, own, int(k))
+        parts = self._contributions(choices, own, share)
         parts[self._is_as_the_expert(policy)] = 0.0
         fields = {
             "bound": _rounded_up(bound, dtype),
@@ -198,16 +204,16 @@ class Agreeing:
             **{name: None if field is None else checks.to_device(field) for name, field in fields.items()},
             worst=checks.to_device(worst, np.int32),
             agreed=checks.to_device(self.agreed),
-            status=checks.to_device(self.status, np.int32),
+            status=checks.to_device(self.status if self.status != Status.SOLVED else own.status, np.int32),
         )
 
     def _plan(self, choices: Choices) -> Found:
         return all_time.best(choices) if self._horizon is None else first_steps.best(choices, self._horizon)
 
-    def _contributions(self, policy: Choices, own: Found, k: int) -> Float[np.ndarray, " S"]:
+    def _contributions(self, policy: Choices, own: Found, share: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
         if self._horizon is None:
-            return all_time.contributions(self._choices, self._best, own, k)
-        return first_steps.contributions(self._choices, policy, k, self._horizon)
+            return all_time.contributions(self._choices, self._best, own, share)
+        return first_steps.contributions(self._choices, policy, share, self._horizon)
 
     def _is_as_the_expert(self, policy: Float[np.ndarray, "S A"]) -> Bool[np.ndarray, " S"]:
         """Where nothing can be lost but by rounding."""
@@ -246,6 +252,6 @@ def _in_words(loss: LossBound) -> str:
             f"states that contribute most: {names}",
             "assumes the true model, and an expert that is deterministic (or whose frequencies are exact) on the "
             f"{int(np.asarray(loss.agreed).sum())} demonstrated states",
-            summary("LossBound", {"status": loss.status}),
+            f"status: {Status(int(loss.status)).name}",
         ]
     )

@@ -20,7 +20,7 @@ from jaxhom.apprenticeship.exact import exact_rows, rounded_down
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.presolve import Reach
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, require_features
 from jaxhom.models.mdp import MDP
 from jaxhom.planning import policy_iteration
 from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
@@ -179,12 +179,6 @@ def solve_lanes(
     lanes = [solve(sides, reach, batch[k], float(tolerance[k])) for k in range(len(batch))]
     learned = jax.tree.map(lambda *leaves: np.stack(leaves), *lanes) if expectations.ndim == 2 else lanes[0]
     return jax.tree.map(checks.to_device, learned)
-
-
-def require_features(mdp: MDP) -> None:
-    """Raises unless the model has features."""
-    if not mdp.num_features:
-        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
 
 
 def goal_of(mdp: MDP, tolerance: float) -> float:

@@ -39,7 +39,7 @@ from jaxhom.apprenticeship.quickest import solve_by_the_quickest
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.sensitivity import with_derivatives, without_tangents
 from jaxhom.apprenticeship.solution import Found, LPALMethod, LPALSolution
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, require_features
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
@@ -161,8 +161,7 @@ class LPAL:
 
     def __init__(self, mdp: MDP):
         self._mdp = as_model(mdp)
-        if not self._mdp.num_features:
-            raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+        require_features(self._mdp)
         model = without_tangents(self._mdp)
         if checks.is_traced(model):
             self._model, self._program = None, Program.of_traced(model)

@@ -28,7 +28,7 @@ from jaxhom.apprenticeship.causal_entropy import (
 )
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.models.demonstrations import Demonstrations
-from jaxhom.models.inputs import as_model
+from jaxhom.models.inputs import as_model, require_features
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.host_chains import host_model
 from jaxhom.planning.occupancy import feature_expectations
@@ -196,8 +196,7 @@ class _Fit(NamedTuple):
 
 def _evidence(mdp: MDP, demonstrations, expectations) -> tuple[Evidence, bool]:
     """What is fitted to, with a leading axis [B] of lanes, and whether that was given."""
-    if not mdp.num_features:
-        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+    require_features(mdp)
     if (demonstrations is None) == (expectations is None):
         raise ValueError("give either demonstrations or expectations")
     if not checks.is_traced(mdp):

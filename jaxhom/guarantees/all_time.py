@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
 
 from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.planning import policy_iteration
@@ -29,7 +28,6 @@ _SWEEPS = 100  # before linear systems are solved, where that is quick; where it
 _SLOW, _MOST_SWEEPS = 0.5, 10_000  # to half of what it was after so many
 _DIRECT = 1e7  # states times bandwidth up to which a direct solve takes less than hundreds of sweeps
 _TOLERANCE, _ROUNDINGS = 1e-12, 8.0  # of what b may span: a share of the largest |feature|, and roundings of |V|
-_KRYLOV_STEPS, _KRYLOV_RESIDUAL, _KRYLOV_ERROR = 500, 1e-13, 1e-9  # what is asked for, and what is good enough
 
 
 def best(choices: Choices) -> Found:
@@ -105,29 +103,5 @@ def _is_direct(choices: Choices) -> bool:
 
 def _solved(choices: Choices, actions, right: Float[np.ndarray, "S L"], *, is_flow: bool) -> Float[np.ndarray, "S L"]:
     """Values of rewards, or occupancies of distributions, under actions [S]; NaN where nothing is found."""
-    model = choices.model
-    found = np.full_like(right, np.nan)
-    if not _is_direct(choices):
-        found = _by_krylov(choices, actions, right, is_flow)
-    if not np.isfinite(found).all() and model.is_solvable:
-        chain = model.chain(actions)
-        found = chain.state_occupancy(right[:, 0])[:, None] if is_flow else chain.value(right)
-    return found
-
-
-def _by_krylov(choices: Choices, actions, right, is_flow: bool) -> Float[np.ndarray, "S L"]:
-    """BiCGSTAB for each right-hand side; NaN where it does not get there."""
-    matrix, discount = choices.leads(actions), choices.discount
-    matrix = matrix.T if is_flow else matrix
-    system = scipy.sparse.linalg.LinearOperator(matrix.shape, lambda v: v - discount * (matrix @ v), dtype=float)
-    options = {"rtol": _KRYLOV_RESIDUAL, "atol": 0.0, "maxiter": _KRYLOV_STEPS}
-    # |(I - gamma P)^-1| is 1 / (1 - gamma) in the norm of sums for flows, and in that of maxima for values.
-    order = 1 if is_flow else np.inf
-    found = np.full_like(right, np.nan)
-    for lane, one in enumerate(right.T):
-        with np.errstate(all="ignore"):
-            solution = scipy.sparse.linalg.bicgstab(system, one, x0=one / (1.0 - discount), **options)[0]
-            missing = np.linalg.norm(one - system @ solution, order) / (1.0 - discount)
-        if missing <= _KRYLOV_ERROR * np.linalg.norm(solution, order):
-            found[:, lane] = solution
-    return found
+    chain = choices.model.chain(actions, may_iterate=True)
+    return chain.flow(right) if is_flow else chain.value(right)

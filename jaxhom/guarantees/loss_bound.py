@@ -25,7 +25,7 @@ from jaxhom.apprenticeship.exact import rounded_down
 from jaxhom.guarantees import all_time, first_steps
 from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
-from jaxhom.models.inputs import as_model, check_policy
+from jaxhom.models.inputs import as_model, check_policy, require_features
 from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.status import Record, Status
@@ -154,8 +154,7 @@ def concrete_problem(name: str, mdp: Any, *given: Any) -> MDP:
     mdp = as_model(mdp)
     if checks.is_traced(mdp, *given):
         raise ValueError(f"{name} plans on the host: call it outside jit, vmap and grad")
-    if not mdp.num_features:
-        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+    require_features(mdp)
     return mdp
 
 

@@ -235,9 +235,11 @@ def _values(mdp: MDP, policy, rewards):
     """V [B, S] of one policy for rewards [B, S, A]; on the host by one factorisation where that is quick."""
     if checks.is_at_hand(mdp, policy, rewards) and host_model(mdp).is_soon_factorised:
         return host_model(mdp).chain(policy).value((policy * rewards).sum(axis=-1, dtype=np.float64).T).T
-    policies = jnp.broadcast_to(policy, rewards.shape)
-    values = policy_value(mdp, policies, rewards)
-    return np.asarray(values) if isinstance(rewards, np.ndarray) else values
+    if not isinstance(rewards, np.ndarray):
+        return policy_value(mdp, jnp.broadcast_to(policy, rewards.shape), rewards)
+    lanes = len(rewards)
+    rewards = np.pad(rewards, [(0, -lanes % _CHUNK), (0, 0), (0, 0)])  # so that few programs serve all numbers
+    return np.asarray(policy_value(mdp, np.broadcast_to(policy, rewards.shape), rewards))[:lanes]
 
 
 def _in_words(queries: Queries) -> str:

@@ -100,6 +100,12 @@ def check_coordinates(mdp: MDP, coordinates: Float[ArrayLike, "S D"]) -> Float[n
     return coordinates if is_traced else checks.require_floats("coordinates", coordinates)
 
 
+def require_features(mdp: MDP) -> None:
+    """Raises unless the model has features."""
+    if not mdp.num_features:
+        raise ValueError("the model has no features: build it with features=[S, A, K], K >= 1")
+
+
 def check_reward(
     mdp: MDP, reward: Num[ArrayLike, "*B S A"], policy_shape: tuple[int, ...]
 ) -> Float[Array | np.ndarray, "*B S A"]:

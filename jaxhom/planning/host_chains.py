@@ -31,7 +31,8 @@ _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
 # than the hundreds of products of an iteration.
 _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
-_SMALL_ERROR, _MAX_PRODUCTS = 1e-10, 300  # of BiCGSTAB; racetracks take 50 steps
+_SMALL_ERROR, _MAX_PRODUCTS = 1e-9, 300  # of BiCGSTAB; racetracks take 50 steps
+_SAFE = 0.1  # of the error: its residual is measured in another norm
 _latest: dict = {}  # one entry at most
 
 
@@ -80,17 +81,21 @@ class HostModel:
 
         With `may_iterate` it is solved by products where factors take long and products do it.
         """
-        states, by_products = np.arange(self.num_states), may_iterate and not self.is_soon_factorised
+        by_products = may_iterate and not self.is_soon_factorised
+        may_factorise = self.is_solvable or not by_products  # who does not want products has asked before
+        return HostChain(self._transition(policy), self.discount, by_products, may_factorise)
+
+    def _transition(self, policy) -> np.ndarray | scipy.sparse.csr_array:
+        states = np.arange(self.num_states)
         if policy.ndim == 1:
-            return HostChain(self.rows[states * self.num_actions + policy], self.discount, by_products)
+            return self.rows[states * self.num_actions + policy]
         policy = np.asarray(policy, np.float64)
         if not scipy.sparse.issparse(self.rows):
-            transition = np.einsum("sa,saz->sz", policy, self.rows.reshape(*policy.shape, -1))
-            return HostChain(transition, self.discount, by_products)
+            return np.einsum("sa,saz->sz", policy, self.rows.reshape(*policy.shape, -1))
         state, action = np.nonzero(policy)
         entries = (policy[state, action], (state, state * self.num_actions + action))
         choice = scipy.sparse.csr_array(entries, shape=(self.num_states, len(states) * self.num_actions))
-        return HostChain(choice @ self.rows, self.discount, by_products)
+        return choice @ self.rows
 
     @functools.cached_property
     def bandwidth(self) -> int:
@@ -137,7 +142,7 @@ class HostModel:
 class HostChain:
     """One chain P_pi: solves with I - gamma P_pi and with its transpose.
 
-    By LU; with `by_products` by BiCGSTAB (van der Vorst 1992), and by LU where that does not get on.
+    By LU; with `by_products` by BiCGSTAB (van der Vorst 1992), and by LU where that does not get on and may be.
     """
 
     def __init__(
@@ -145,8 +150,9 @@ class HostChain:
         transition: Float[np.ndarray, "S S"] | scipy.sparse.csr_array,
         discount: float,
         by_products: bool = False,
+        may_factorise: bool = True,
     ) -> None:
-        self._discount, self._by_products = discount, by_products
+        self._discount, self._by_products, self._may_factorise = discount, by_products, may_factorise
         if not scipy.sparse.issparse(transition):
             self._transition = transition / _or_one(transition.sum(axis=1))[:, None]
             return
@@ -180,7 +186,7 @@ class HostChain:
         """V of rewards r_pi; NaN where rounding leaves more than a thousandth (of the largest) open.
 
         Args:
-          reward: [S], or several of them [S, K] where factors solve.
+          reward: [S], or several of them [S, K].
           error: share of the values that may be off where products solve.
         """
         return self._checked(reward, is_flow=False, error=error)
@@ -195,30 +201,36 @@ class HostChain:
 
     def _checked(self, right: np.ndarray, is_flow: bool, error: float = _SMALL_ERROR) -> np.ndarray:
         if self._by_products:
-            solution = self._accepted(right, self._iterate(right, is_flow, error), is_flow)
-            if np.isfinite(solution).all():
+            solution = self._iterate(right, is_flow, error)
+            if self._is_within(error, right, solution, is_flow) or not self._may_factorise:
                 return solution
-        return self._accepted(right, self._solve(right, is_flow), is_flow)
+        solution = self._solve(right, is_flow)
+        return solution if self._is_within(_GOOD_ENOUGH, right, solution, is_flow) else np.full_like(solution, np.nan)
 
-    def _accepted(self, right: np.ndarray, solution: np.ndarray, is_flow: bool) -> np.ndarray:
-        """The solution, or NaN."""
+    def _is_within(self, error: float, right: np.ndarray, solution: np.ndarray, is_flow: bool) -> bool:
+        """Whether a solution is off by no more than a share of its size."""
         missing = right - solution + self._discount * self._step(solution, is_flow)
         # |(I - gamma P)^-1| is 1 / (1 - gamma) in the norm of sums for flows, and in that of maxima for values.
         norm = (lambda v: np.abs(v).sum()) if is_flow else (lambda v: np.abs(v).max())
         size = max(norm(solution), norm(right))
-        if not norm(missing) <= _GOOD_ENOUGH * (1.0 - self._discount) * size + np.finfo(float).tiny:
-            return np.full_like(solution, np.nan)
-        return solution
+        return bool(norm(missing) <= error * (1.0 - self._discount) * size + np.finfo(float).tiny)
 
     def _step(self, vector: np.ndarray, is_flow: bool) -> np.ndarray:
         return self._transition.T @ vector if is_flow else self._transition @ vector
 
     def _iterate(self, right: np.ndarray, is_flow: bool, error: float) -> np.ndarray:
+        """Column by column; NaN where it does not get there."""
         operator = scipy.sparse.linalg.LinearOperator(
             self._transition.shape, lambda x: x - self._discount * self._step(x, is_flow), dtype=np.float64
         )
-        options = {"rtol": error * (1.0 - self._discount), "maxiter": _MAX_PRODUCTS}
-        return scipy.sparse.linalg.bicgstab(operator, right, **options)[0]
+        options = {"rtol": _SAFE * error * (1.0 - self._discount), "maxiter": _MAX_PRODUCTS}
+        solution = np.full(right.shape, np.nan)
+        for column in np.ndindex(right.shape[1:]):
+            with np.errstate(all="ignore"):
+                found = scipy.sparse.linalg.bicgstab(operator, right[:, *column], **options)[0]
+            if self._is_within(error, right[:, *column], found, is_flow):
+                solution[:, *column] = found
+        return solution
 
     def _solve(self, right: np.ndarray, is_flow: bool) -> np.ndarray:
         if isinstance(self._factor, tuple):

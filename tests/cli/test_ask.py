@@ -123,6 +123,19 @@ def test_the_likelihood_is_that_of_the_choice(files, method):
     assert len(files.report()["rounds"]) == 1
 
 
+def test_learn_and_plot_take_demonstrations_with_answers(files, capsys):
+    assert main(["ask", *files.options(), *PLAIN, "--answers", "expert", "--count", "2", "--rounds", "1"]) == 0
+    capsys.readouterr()
+    shown = ["--mdp", "model.npz", "--demonstrations", "out/demonstrations.npz", "--output", "again"]
+    assert main(["learn", *shown, *PLAIN]) == 0
+    np.testing.assert_array_equal(files.policy("again/policy.npz"), files.policy())
+    counts = files.report("again/report.json")["demonstrations"]
+    assert (counts["trajectories"], counts["steps"], counts["answers"], counts["states"]) == (2, 8, 2, 8)
+    assert re.search(r"answers about single states +2\n", capsys.readouterr().out)
+    for model in (["--mdp", "model.npz"], ["--env", LAKE]):
+        assert main(["plot", "trajectories", "out/demonstrations.npz", *model, "--output", "walks.png"]) == 0
+
+
 def test_pictures_of_questions(files):
     arguments = ["--env", LAKE, "--expert", "1", "--answers", "expert", "--rounds", "1", "--output", "out"]
     assert main(["ask", *arguments, "--method", "maximum-entropy"]) == 0

@@ -8,7 +8,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt  # noqa: E402
 
-from jaxhom import Demonstrations, plotting  # noqa: E402
+from jaxhom import Demonstrations, gridworld, plotting  # noqa: E402
 
 POLICY = np.array([[0.25, 0.75], [1.0, 0.0], [0.5, 0.5]])
 
@@ -73,3 +73,16 @@ def test_malformed_input_is_rejected(draw, message):
     with pytest.raises(ValueError, match=message):
         draw()
     assert not plt.get_fignums()
+
+
+def test_answers_have_no_time_and_no_offset(ax):
+    """By state they are left out; on a map they are rings, and the other trajectories run as they did."""
+    walks = Demonstrations.from_trajectories([([0, 1, 5], [3, 1, 1]), ([4, 5], [3, 3])])
+    shown = walks.with_answers([9, 10], [0, 1])
+    plain, answered = (plotting.plot_trajectories_by_state(some) for some in (walks, shown))
+    assert len(answered.lines) == len(plain.lines)
+    grid = gridworld(4)
+    plain, answered = plotting.plot_trajectories(grid, walks), plotting.plot_trajectories(grid, shown, ax=ax)
+    for one, other in zip(plain.lines, answered.lines, strict=False):
+        np.testing.assert_allclose(other.get_xydata(), one.get_xydata())
+    np.testing.assert_allclose(answered.lines[2].get_xydata(), [[1, 2]])

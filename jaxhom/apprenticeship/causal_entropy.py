@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.apprenticeship.presolve import Reach
-from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.demonstrations import Demonstrations, action_counts
 from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.planning.host_chains import HostChain, HostModel
 from jaxhom.planning.soft_optimal import soft_optimal_policy, soft_values_on_host
@@ -55,14 +55,8 @@ def scaled_features(mdp: MDP) -> tuple[Float[Array, "S A K"], Float[Array, " K"]
 
 def frequencies_of(mdp: MDP, demonstrations: Demonstrations) -> Float[Array, "S A"]:
     """How often each action was taken in each state, as shares of all decisions; zero if there was none."""
-    states, actions, mask = demonstrations.states, demonstrations.actions, demonstrations.mask
-    xp = checks.arrays_of(mdp, states, actions, mask)
-    shape = mdp.allowed.shape
-    if xp is np:
-        pairs = np.ravel_multi_index((np.asarray(states)[mask], np.asarray(actions)[mask]), shape)
-        counts = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
-    else:
-        counts = jnp.zeros(shape, jnp.int32).at[states, actions].add(mask.astype(jnp.int32))
+    counts = action_counts(mdp, demonstrations)
+    xp = checks.arrays_of(mdp, counts)
     counts = xp.where(deciding_states(mdp, counts.sum(axis=1) > 0)[:, None], counts, 0).astype(mdp.dtype)
     return counts / xp.maximum(counts.sum(), 1)
 

@@ -234,19 +234,24 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[Bool[Arr
     """
     mdp = as_model(mdp)
     demonstrations.validate(mdp, "warn")
-    shape = (mdp.num_states, mdp.num_actions)
-    states, actions, mask = demonstrations.states, demonstrations.actions, demonstrations.mask
-    xp = checks.arrays_of(mdp, states, actions, mask)
-    # Counted in integers and divided in JAX's default type: float32 would stop counting at 2^24, float16 at 2^11.
-    if xp is np:
-        pairs = np.ravel_multi_index((np.asarray(states)[mask], np.asarray(actions)[mask]), shape)
-        counts = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
-    else:
-        counts = jnp.zeros(shape, jnp.int32).at[states, actions].add(mask.astype(jnp.int32)).astype(float)
+    counts = action_counts(mdp, demonstrations)
+    xp = checks.arrays_of(mdp, counts)
     visits = counts.sum(axis=-1, keepdims=True)
     visited = visits[:, 0] > 0
     frequencies = (counts / xp.maximum(visits, 1.0)).astype(mdp.dtype)
     return tuple(map(checks.to_device, (visited, xp.where(visited[:, None], frequencies, uniform_policy(mdp)))))
+
+
+def action_counts(mdp: MDP, demonstrations: Demonstrations) -> Float[Array, "S A"] | Int[np.ndarray, "S A"]:
+    """How often each action was taken in each state; in NumPy at hand, also under `jit` and `vmap`."""
+    shape = (mdp.num_states, mdp.num_actions)
+    states, actions, mask = demonstrations.states, demonstrations.actions, demonstrations.mask
+    # Counted in integers and divided in JAX's default type: float32 would stop counting at 2^24, float16 at 2^11.
+    if checks.is_at_hand(mdp, states, actions, mask):
+        mask = np.asarray(mask)
+        pairs = np.ravel_multi_index((np.asarray(states)[mask], np.asarray(actions)[mask]), shape)
+        return np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
+    return jnp.zeros(shape, jnp.int32).at[states, actions].add(mask.astype(jnp.int32)).astype(float)
 
 
 @checks.eager_where_concrete

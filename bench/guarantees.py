@@ -1,7 +1,7 @@
 """Methods that compare bounds on losses with true losses, and the policy that loses least in the worst case.
 
 The certificate of a row is a bound per step: on the loss under the true reward ("true weights"), or under any reward
-whose weights sum to 1 ("worst weights"). The true loss is in the same row.
+whose weights have the same sum ("worst weights"). The true loss is in the same row, in the same units.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ def bounded(problem: Problem, *, name: str, kind: str) -> Learned:
     """A method's policies with the bounds on their losses, per step."""
     mdp, lane = problem.domain.mdp, list(_POLICIES).index(name)
     found = problem.once(bounds)
+    weights = np.asarray(problem.weights)
     if kind == WORST:
-        loss = np.array([one.bound[lane] for one in found])
+        loss = weights.sum(axis=1) * np.array([one.bound[lane] for one in found])
     else:
-        weights = problem.weights / problem.weights.sum(axis=1, keepdims=True)
-        loss = np.array([w @ one.gaps[lane] for w, one in zip(weights, found, strict=True)])
+        loss = np.array([w @ np.asarray(one.gaps[lane]) for w, one in zip(weights, found, strict=True)])
     status = np.array([int(one.status[lane]) for one in found])
     return Learned(problem.once(_POLICIES[name]).policy, status, loss * (1.0 - float(mdp.discount)))
 
@@ -62,7 +62,7 @@ def bounded(problem: Problem, *, name: str, kind: str) -> Learned:
 def least(problem: Problem) -> Learned:
     """The robust policy, and what no policy's worst loss is below."""
     one_step = 1.0 - float(problem.domain.mdp.discount)
-    floor = np.array([float(one.least_loss) for one in problem.once(robust)])
+    floor = np.asarray(problem.weights).sum(axis=1) * np.array([float(one.least_loss) for one in problem.once(robust)])
     policies = problem.once(_robust_policies)
     return Learned(policies.policy, policies.status, floor * one_step)
 

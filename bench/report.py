@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import matplotlib
 import pandas as pd
 
-from bench import comparison, figures, relations, summaries, tables
+from bench import comparison, figures, learning_report, relations, summaries, tables
 from bench.provenance import RESULTS
 from bench.rows import Row, read_rows
 from bench.summaries import CONFIDENCE
@@ -140,7 +140,8 @@ def _compared(name: str, title: str, note: str) -> Callable:
 
     def part(rows: list[Row], folder: pathlib.Path) -> str:
         lines = summaries.write(name, rows, folder)
-        _save(figures.relations_figure(lines), folder / name)
+        figure = figures.heat_map(lines, "homomorphism 0", "Algorithm 1 at threshold 0")
+        _save(figure, folder / name)
         text = f"## {title}\n\n{_health(rows)}\n\n![{title}]({name}.png)\n\n{note}"
         if name not in relations.CANDIDATES:
             return text
@@ -150,6 +151,22 @@ def _compared(name: str, title: str, note: str) -> Callable:
         return text
 
     return part
+
+
+def _learners(rows: list[Row], folder: pathlib.Path) -> str:
+    lines = summaries.write("learners", rows, folder)
+    _save(figures.heat_map(lines, "Algorithm 1", "Algorithm 1"), folder / "learners")
+    title = "Learners: weights from demonstrations, from expectations, and from nothing"
+    text = f"## {title}\n\n{_health(rows)}\n\n![{title}](learners.png)"
+    return f"{text}\n\n{learning_report.LEARNERS_NOTE}\n\n{learning_report.learners_table(lines)}"
+
+
+def _guarantees(rows: list[Row], folder: pathlib.Path) -> str:
+    lines = summaries.write("guarantees", rows, folder)
+    _save(learning_report.guarantees_figure(lines), folder / "guarantees")
+    title = "Guarantees: how much can be lost, and how much was"
+    text = f"## {title}\n\n{_health(rows)}\n\n![{title}](guarantees.png)\n\n{learning_report.GUARANTEES_NOTE}"
+    return f"{text}\n\n{learning_report.guarantees_words(rows, lines)}"
 
 
 _PARTS = {
@@ -180,6 +197,14 @@ _PARTS = {
     "relations": _compared("relations", "Relations: what makes states similar, who votes", _RELATIONS_NOTE),
     "roads": _compared("roads", "Roads: labels that say how much of a detour an exit is", _ROADS_NOTE),
     "transfer": _compared("transfer", "Transfer: racetrack (a) demonstrated, (b) learned", _TRANSFER_NOTE),
+    "learners": _learners,
+    "guarantees": _guarantees,
+    "queries": _question(
+        "queries",
+        "Queries: which single states to ask the expert about",
+        learning_report.queries_figure,
+        lambda lines: f"{learning_report.QUERIES_NOTE}\n\n{learning_report.queries_words(lines)}",
+    ),
 }
 
 

@@ -16,7 +16,7 @@ TILED_LENGTHS = {"tiles8": (40, 100), "tiles16": (80, 200)}
 QUESTIONS_PER_ROUND = {"tiles8": 5}
 """How many states are asked about before the next policy is learned; 20 where nothing else is said."""
 WEIGHT_SUMS = {"track_a": 205.0, "track_b": 205.0}
-"""What the weights of the true reward sum to where that is not 1: losses are compared in weights of sum 1."""
+"""What the weights of the true reward sum to on tracks, where losses are reported in weights of sum 1."""
 
 
 @dataclasses.dataclass(frozen=True)

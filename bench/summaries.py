@@ -5,6 +5,7 @@ have in common cancels. `table1` has a line per grid, number of regions and meth
 `lines` has one per setting, method and metric.
 """
 
+import dataclasses
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import pandas as pd
 import scipy.stats
 
 from bench.rows import Row
+from bench.settings import WEIGHT_SUMS
 
 PAPER = pathlib.Path(__file__).resolve().parent / "paper_table1.csv"
 CONFIDENCE = 0.95
@@ -55,7 +57,7 @@ def frame(rows: Iterable[Row]) -> pd.DataFrame:
     """The rows with numbers, with the ratio to the expert; methods are ordered as they first occur."""
     found = pd.DataFrame([vars(row) for row in rows])
     found["method"] = pd.Categorical(found["method"], found["method"].unique(), ordered=True)
-    numbers = [*METRICS, "expert_reward", "sampled_error"]
+    numbers = [*METRICS, "expert_reward", "sampled_error", "loss_bound", "certificate"]
     found = found[found["error"] == ""].astype(dict.fromkeys(numbers, float))
     return found.assign(ratio=found["reward_per_step"] / found["expert_reward"])
 
@@ -121,9 +123,21 @@ def question(rows: Iterable[Row]) -> pd.DataFrame:
     return lines(rows, QUESTION_KEY, (*METRICS, "ratio"))
 
 
+def guarantees(rows: Iterable[Row]) -> pd.DataFrame:
+    """One line per setting, method and metric: bounds and true losses per step; on tracks in weights of sum 1."""
+    return lines(map(_in_units, rows), QUESTION_KEY, ("certificate", "loss_bound", "ratio"))
+
+
+def _in_units(row: Row) -> Row:
+    if row.loss_bound is None or row.certificate is None:
+        return row
+    scale = 1.0 / WEIGHT_SUMS.get(row.domain, 1.0)
+    return dataclasses.replace(row, loss_bound=scale * row.loss_bound, certificate=scale * row.certificate)
+
+
 def write(name: str, rows: Iterable[Row], folder: pathlib.Path) -> pd.DataFrame:
     """Writes the summary file of a sweep, numbers to six digits, and returns its lines."""
-    found = {"table1": table1, "figure1": figure1}.get(name, question)(rows)
+    found = {"table1": table1, "figure1": figure1, "guarantees": guarantees}.get(name, question)(rows)
     columns = list(TABLE1_COLUMNS) if name == "table1" else None
     found.to_csv(folder / f"{name}.csv", columns=columns, index=False, float_format="%.6g", lineterminator="\n")
     return found

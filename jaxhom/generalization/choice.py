@@ -90,8 +90,10 @@ def choose_generalization(
         `default_candidates` says which: isomorphism, and Weisfeiler-Lehman, LP (9), random walks and, for up to 6
         actions, "lax" at three thresholds, k-NN, and uniform; with labels also LP (9) and random walks with all voters,
         weighted.
-      distance, labels, label_weight, states: what `soft_local_homomorphism` takes, for candidates that do not say
-        otherwise. Steps in states that are left out do not count.
+      distance: as `soft_local_homomorphism` takes it, for candidates that do not say otherwise.
+      labels: likewise.
+      label_weight: likewise.
+      states: likewise; steps in states that are left out do not count.
       mixing: in (0, 1], the share of the uniform policy, without which one wrong step would decide. If None each
         candidate has the share, from 1 % on, under which it is likeliest: with little of it one that is right in half
         of the states, which may be by far the best, would score below `uniform_elsewhere`. In states that other

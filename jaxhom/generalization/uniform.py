@@ -65,8 +65,8 @@ def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
       >>> with warnings.catch_warnings(record=True) as said:
       ...     warnings.simplefilter("always")
       ...     general = jaxhom.maximum_entropy(jaxhom.gridworld(4), demonstrations)
-      >>> [warning.category.__name__ for warning in said]
-      ['DeprecationWarning']
+      >>> print(*(warning.category.__name__ for warning in said))
+      DeprecationWarning
     """
     warnings.warn(
         "maximum_entropy is now called uniform_elsewhere: it is no maximum-entropy inverse reinforcement learning",

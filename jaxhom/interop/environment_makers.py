@@ -35,8 +35,8 @@ def make_environment(name: str, **options: Any) -> gymnasium.Env:
 
     Example:
       >>> env = make_environment("FrozenLake-v1", is_slippery=False)
-      >>> [int(outcome[1]) for outcome in env.unwrapped.P[0][1]]  # from state 0, by action 1: down
-      [4]
+      >>> print(*(int(outcome[1]) for outcome in env.unwrapped.P[0][1]))  # from state 0, by action 1: down
+      4
     """
     try:
         import gymnasium

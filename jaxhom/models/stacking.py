@@ -53,8 +53,8 @@ def stack_models(models: Iterable[MDP]) -> MDP:
       >>> stacked = stack_models([gridworld(5, noise=noise, discount=0.9) for noise in (0.0, 0.3, 0.6)])
       >>> reward = jnp.zeros((25, 4)).at[24].set(1.0)
       >>> value = jax.vmap(lambda mdp: optimal_policy(mdp, reward).value[0])(stacked)
-      >>> [round(float(v), 3) for v in value]
-      [4.305, 2.744, 1.164]
+      >>> print(*(round(float(v), 3) for v in value))
+      4.305 2.744 1.164
     """
     stacked = as_models(models, "a stack")
     require_alike(stacked, _traits)

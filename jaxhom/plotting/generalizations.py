@@ -168,8 +168,8 @@ def plot_generalization(
       >>> world = jaxhom.gridworld(4)
       >>> walk = jaxhom.Demonstrations.from_trajectories([([0, 1, 2], [3, 3, 3])])
       >>> general = jaxhom.nearest_neighbors(world, walk)
-      >>> [panel.get_title(loc="left") for panel in plot_generalization(world, general)]
-      ['radius', 'support', 'policy']
+      >>> print(*(panel.get_title(loc="left") for panel in plot_generalization(world, general)))
+      radius support policy
     """
     board = board_of(domain)
     mosaic = speed is None and board.per_cell > 1

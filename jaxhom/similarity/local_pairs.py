@@ -150,8 +150,11 @@ def locally_similar(
       sources: int [P], the state s of each pair.
       targets: int [P], its s'.
       threshold: epsilon >= 0.
-      target_mdp, labels, target_labels, label_weight: as in `local_similarity`.
-      distance: d >= 1, as in `local_similarity`.
+      target_mdp: as in `local_similarity`.
+      labels: likewise.
+      target_labels: likewise.
+      label_weight: likewise.
+      distance: d >= 1, likewise.
       anchored: as in `local_similarity`.
       mutual: require the error of both directions to be within the threshold.
       tolerance: width of the band.

@@ -305,7 +305,8 @@ class SimilarityTable:
         Args:
           threshold: epsilon >= 0, one that the table was completed for.
           mutual: require the error of both directions to be within the threshold.
-          tolerance, with_errors: as they were when the table was completed.
+          tolerance: as it was when the table was completed.
+          with_errors: likewise.
 
         Returns:
           `Relation`.

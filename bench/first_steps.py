@@ -130,6 +130,58 @@ def _global(size: int, regions: int):
     return lambda: jaxhom.soft_homomorphism(mdp, walks)
 
 
+def _track():
+    """Racetrack (a), and 10 walks of its best policy, which is found on the host."""
+    import numpy as np
+
+    from jaxhom.planning import policy_iteration
+    from jaxhom.planning.host_chains import host_model
+
+    jaxhom, rng = _library(), np.random.default_rng(0)
+    track = jaxhom.racetrack("a")
+    reward = np.asarray(track.mdp.features) @ np.asarray(track.weights)
+    plan = policy_iteration.iterate(host_model(track.mdp), reward, reward.argmax(axis=1), np.finfo(float).eps)
+    walks = [_walk(rng, track.mdp, np.eye(track.mdp.num_actions)[plan.actions], 20) for _ in range(10)]
+    return jaxhom, track.mdp, jaxhom.Demonstrations.from_trajectories(walks)
+
+
+def _weights_of_grid():
+    jaxhom, mdp, _, _, walks = _given()
+    return lambda: jaxhom.max_causal_entropy(mdp, walks)
+
+
+def _weights_of_track():
+    jaxhom, mdp, walks = _track()
+    return lambda: jaxhom.max_causal_entropy(mdp, walks)
+
+
+def _learner(name: str, **options):
+    jaxhom, mdp, _, policy, _ = _given()
+    expectations = jaxhom.feature_expectations(mdp, policy)
+    return lambda: getattr(jaxhom, name)(mdp, 0.99 * expectations, **options)
+
+
+def _loss_on_grid():
+    jaxhom, mdp, _, policy, walks = _given()
+    return lambda: jaxhom.loss_bound(mdp, walks, policy)
+
+
+def _loss_on_track():
+    jaxhom, mdp, walks = _track()
+    general = jaxhom.uniform_elsewhere(mdp, walks)
+    return lambda: jaxhom.loss_bound(mdp, walks, general.policy)
+
+
+def _robust():
+    jaxhom, mdp, *_, walks = _given()
+    return lambda: jaxhom.robust_policy(mdp, walks)
+
+
+def _questions():
+    jaxhom, mdp, _, policy, walks = _given()
+    return lambda: jaxhom.query_states(mdp, walks, policy, 20)
+
+
 def _whole():
     """From nothing to the learned policy's value, with everything that a script would do on the way."""
     jaxhom = _library()
@@ -260,6 +312,14 @@ STEPS: dict[str, dict[str, Callable[[], Callable[[], Any]]]] = {
         "highs_interior_point": functools.partial(_global_peer, 6, 9),
     },
     "LP (8), 256 states": {"jaxhom": functools.partial(_global, SIZE, REGIONS)},
+    "max. causal entropy": {"jaxhom": _weights_of_grid},
+    "max. causal entropy, racetrack (a)": {"jaxhom": _weights_of_track},
+    "projection": {"jaxhom": functools.partial(_learner, "projection", max_iterations=100)},
+    "MWAL, 100 rounds": {"jaxhom": functools.partial(_learner, "mwal", max_iterations=100)},
+    "loss bound, 64 features": {"jaxhom": _loss_on_grid},
+    "loss bound, racetrack (a)": {"jaxhom": _loss_on_track},
+    "robust policy, 64 features": {"jaxhom": _robust},
+    "20 queries": {"jaxhom": _questions},
     "the whole way": {"jaxhom": _whole},
     "a second 8x8 map": {"jaxhom": _second_map},
 }

@@ -106,7 +106,7 @@ METHODS = {
         "soft homomorphism, LP (8)", _global, ("printed", "tolerance", "max_iterations", *_COMPARED)
     ),
     "nearest-neighbors": Method("k-NN", _nearest, ("metric",)),
-    "maximum-entropy": Method("maximum entropy", _uniform),
+    "maximum-entropy": Method("uniform elsewhere", _uniform),
     "regression": Method("regression", _regression),
     "monte-carlo": Method("Monte Carlo expectations", None),
 }

@@ -32,6 +32,7 @@ _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
 _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _SMALL_ERROR, _MAX_PRODUCTS = 1e-9, 300  # of BiCGSTAB; racetracks take 50 steps
+_FIRST_SWEEPS = 20
 _SAFE = 0.1  # of the error: its residual is measured in another norm
 _latest: dict = {}  # one entry at most
 
@@ -75,14 +76,19 @@ class HostModel:
         return (self.rows @ value).reshape(self.num_states, self.num_actions)
 
     def chain(
-        self, policy: Float[np.ndarray, "S A"] | Int[np.ndarray, " S"], *, may_iterate: bool = False
+        self,
+        policy: Float[np.ndarray, "S A"] | Int[np.ndarray, " S"],
+        *,
+        may_iterate: bool = False,
+        may_factorise: bool = True,
     ) -> HostChain:
         """The chain of a policy, or of the actions that a deterministic one takes.
 
-        With `may_iterate` it is solved by products where factors take long and products do it.
+        With `may_iterate` it is solved by products where factors take long and products do it; where they do not, by
+        factors if these may be.
         """
         by_products = may_iterate and not self.is_soon_factorised
-        may_factorise = self.is_solvable or not by_products  # who does not want products has asked before
+        may_factorise &= self.is_solvable or not by_products  # who does not want products has asked before
         return HostChain(self._transition(policy), self.discount, by_products, may_factorise)
 
     def _transition(self, policy) -> np.ndarray | scipy.sparse.csr_array:
@@ -114,6 +120,13 @@ class HostModel:
     def is_narrow(self) -> bool:
         """Whether sparse LU is the quickest way: graphs like roads, grids and corridors."""
         return self.bandwidth <= _NARROW * np.sqrt(self.num_states)
+
+    def iterates_sooner(self, lanes: int) -> bool:
+        """Whether products on the host should be tried before the device: few systems of a sparse model.
+
+        They take tens of milliseconds where the chain mixes, and a program seconds to compile.
+        """
+        return lanes <= _FEW_LANES and scipy.sparse.issparse(self.rows)
 
     def solves_sooner(self, lanes: int) -> bool:
         """Whether the host should be asked before the device for so many linear systems.
@@ -191,15 +204,15 @@ class HostChain:
         """
         return self._checked(reward, is_flow=False, error=error)
 
-    def state_occupancy(self, initial: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
+    def state_occupancy(self, initial: Float[np.ndarray, " S"], error: float = _SMALL_ERROR) -> Float[np.ndarray, " S"]:
         """mu of an initial distribution; likewise."""
-        return np.maximum(self.flow(initial), 0.0)
+        return np.maximum(self.flow(initial, error), 0.0)
 
-    def flow(self, source: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
+    def flow(self, source: Float[np.ndarray, "S *K"], error: float = _SMALL_ERROR) -> Float[np.ndarray, "S *K"]:
         """(I - gamma P)^-T of a source that may have either sign; likewise."""
-        return self._checked(source, is_flow=True)
+        return self._checked(source, is_flow=True, error=error)
 
-    def _checked(self, right: np.ndarray, is_flow: bool, error: float = _SMALL_ERROR) -> np.ndarray:
+    def _checked(self, right: np.ndarray, is_flow: bool, error: float) -> np.ndarray:
         if self._by_products:
             solution = self._iterate(right, is_flow, error)
             if self._is_within(error, right, solution, is_flow) or not self._may_factorise:
@@ -226,8 +239,11 @@ class HostChain:
         options = {"rtol": _SAFE * error * (1.0 - self._discount), "maxiter": _MAX_PRODUCTS}
         solution = np.full(right.shape, np.nan)
         for column in np.ndindex(right.shape[1:]):
+            start = right[:, *column]  # sweeps first: from a single state on, steps that do not come back break it off
+            for _ in range(_FIRST_SWEEPS):
+                start = right[:, *column] + self._discount * self._step(start, is_flow)
             with np.errstate(all="ignore"):
-                found = scipy.sparse.linalg.bicgstab(operator, right[:, *column], **options)[0]
+                found = scipy.sparse.linalg.bicgstab(operator, right[:, *column], x0=start, **options)[0]
             if self._is_within(error, right[:, *column], found, is_flow):
                 solution[:, *column] = found
         return solution

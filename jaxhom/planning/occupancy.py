@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     Policy = Float[ArrayLike, "*B S A"] | Int[ArrayLike, " S"]
 
+_EXACT = 1e-10  # relative error of products on the host that counts as none
 NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0: what solvers leave where nothing goes
 
 
@@ -209,14 +210,21 @@ def _solve_at_hand(mdp: MDP, policy: jax.Array, source: np.ndarray, *, transpose
     """
     policies = np.asarray(policy).reshape(-1, mdp.num_states, mdp.num_actions)
     sources = np.broadcast_to(source, (len(policies), mdp.num_states))
-    model = host_model(mdp)
-    if model.solves_sooner(len(policies)):
-        solutions = np.full(sources.shape, np.nan)
-    else:
-        solve = _state_occupancy if transpose else _solve_values
-        solutions = np.array(solve(mdp, np.moveaxis(policies, 0, -1), sources.T, is_quick=True).T)
+    model, solutions = host_model(mdp), np.full(sources.shape, np.nan)
+
+    def on_host(lane: int, **options) -> np.ndarray:
+        chain = model.chain(policies[lane], **options)
+        return (chain.state_occupancy if transpose else chain.value)(sources[lane].astype(np.float64), _EXACT)
+
+    if not model.solves_sooner(len(policies)):
+        if model.iterates_sooner(len(policies)):
+            for lane in range(len(policies)):
+                solutions[lane] = on_host(lane, may_iterate=True, may_factorise=False)
+        (left,) = np.nonzero(np.isnan(solutions).any(axis=1))
+        if len(left):
+            solve = _state_occupancy if transpose else _solve_values
+            solutions[left] = solve(mdp, np.moveaxis(policies[left], 0, -1), sources[left].T, is_quick=True).T
     (left,) = np.nonzero(np.isnan(solutions).any(axis=1))
     for lane in left if model.is_solvable else ():
-        chain = model.chain(policies[lane])
-        solutions[lane] = (chain.state_occupancy if transpose else chain.value)(sources[lane].astype(np.float64))
+        solutions[lane] = on_host(lane)
     return solutions.reshape(policy.shape[:-1]).astype(mdp.dtype)

@@ -72,7 +72,7 @@ def _table(setting: Setting, model: MDP, labels=None, **kind) -> SimilarityTable
 @functools.lru_cache(maxsize=64)
 def shared_table(domain: str, distance: int, is_labelled: bool, **kind) -> SimilarityTable:
     """A domain's table of similarities, with the labels of the domain or without."""
-    found = build_domain(domain, 1 if domain.startswith("grid") else 0)
+    found = build_domain(domain, 4 if domain.startswith(("grid", "wrong")) else 0)
     return SimilarityTable(found.bare, distance=distance, labels=found.labels if is_labelled else None, **kind)
 
 

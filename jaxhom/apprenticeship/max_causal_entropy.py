@@ -10,6 +10,7 @@ in thousandths are treated alike; the weights that are returned are those of the
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,13 +28,14 @@ from jaxhom.apprenticeship.causal_entropy import (
     scaled_features,
 )
 from jaxhom.apprenticeship.learned import Learned
-from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.demonstrations import Demonstrations, require_demonstrations
 from jaxhom.models.inputs import as_model, require_features
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.host_chains import host_model
 from jaxhom.planning.occupancy import feature_expectations
 from jaxhom.planning.optimal import optimal_policy
 from jaxhom.planning.soft_optimal import soft_optimal_policy
+from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -122,11 +124,13 @@ def max_causal_entropy(
         max_iterations=checks.require_count("max_iterations", max_iterations),
     )
     start = _start(mdp, initial_weights, scale, problem.nonnegative)
-    if optimizer is None and checks.is_at_hand(mdp, evidence, start):
-        fit = _fit_on_host(mdp, features, evidence, start, problem, progress)
-    else:
-        fit = _fit_in_program(mdp, features, evidence, start, problem, optimizer)
-    found = _learned(mdp, features, scale, fit, problem)
+    on_host = optimizer is None and checks.is_at_hand(mdp, evidence, start)
+    with one_blas_thread() if on_host else contextlib.nullcontext():
+        if on_host:
+            fit = _fit_on_host(mdp, features, evidence, start, problem, progress)
+        else:
+            fit = _fit_in_program(mdp, features, evidence, start, problem, optimizer)
+        found = _learned(mdp, features, scale, fit, problem)
     if not is_batch:
         xp = checks.arrays_of(found)
         found = jax.tree.map(lambda leaf: xp.asarray(leaf)[0], found)
@@ -205,9 +209,7 @@ def _evidence(mdp: MDP, demonstrations, expectations) -> tuple[Evidence, bool]:
         expectations = checked_expectations(mdp, expectations)
         is_batch = expectations.ndim == 2
         return Evidence(expectations=expectations if is_batch else expectations[None]), is_batch
-    if not isinstance(demonstrations, Demonstrations):
-        raise ValueError(f"demonstrations must be Demonstrations, got {type(demonstrations).__name__}")
-    demonstrations.validate(mdp, "warn")
+    require_demonstrations(demonstrations).validate(mdp, "warn")
     frequencies = frequencies_of(mdp, demonstrations)
     if not checks.is_traced(frequencies) and not np.asarray(frequencies).any():
         raise ValueError("demonstrations hold no decision: no step, or none outside absorbing states")

@@ -25,6 +25,7 @@ from jaxhom.models.mdp import MDP
 from jaxhom.planning import policy_iteration
 from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
 from jaxhom.planning.optimal import optimal_policy
+from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -176,7 +177,8 @@ def solve_lanes(
         shapes = {(), batch.shape[:1]} if expectations.ndim == 2 else {()}
         checks.require_shape("tolerance", tolerance, " or ".join(map(str, shapes)), np.shape(tolerance) in shapes)
     tolerance = np.broadcast_to(np.asarray(tolerance, np.float64), len(batch))
-    lanes = [solve(sides, reach, batch[k], float(tolerance[k])) for k in range(len(batch))]
+    with one_blas_thread():  # matrices are small: where other work keeps cores busy, threads wait for each other
+        lanes = [solve(sides, reach, batch[k], float(tolerance[k])) for k in range(len(batch))]
     learned = jax.tree.map(lambda *leaves: np.stack(leaves), *lanes) if expectations.ndim == 2 else lanes[0]
     return jax.tree.map(checks.to_device, learned)
 

@@ -35,6 +35,7 @@ from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning.host_chains import host_model
 from jaxhom.planning.occupancy import feature_expectations, occupancy
 from jaxhom.planning.optimal import optimal_policy
+from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.solvers.sum_of_minima import SumOfMinima
 from jaxhom.status import Status
 
@@ -120,9 +121,10 @@ def inverse_lp(
     limit = checks.require_count("max_iterations", max_iterations)
     if mdp.num_features:
         check_features(mdp)
-    if isinstance(expert, Demonstrations):
-        return _from_demonstrations(mdp, expert, options, limit)
-    return _from_policy(mdp, np.asarray(check_policy(mdp, expert, "expert", batch=False)), options)
+    with one_blas_thread():
+        if isinstance(expert, Demonstrations):
+            return _from_demonstrations(mdp, expert, options, limit)
+        return _from_policy(mdp, np.asarray(check_policy(mdp, expert, "expert", batch=False)), options)
 
 
 def _checked_options(l1, max_weight, nonnegative) -> dict:

@@ -10,6 +10,7 @@ in thousandths are treated alike; the weights that are returned are those of the
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -21,12 +22,13 @@ from jaxhom.apprenticeship.arguments import check_features, checked_expectations
 from jaxhom.apprenticeship.causal_entropy import Evidence, frequencies_of, scaled_features
 from jaxhom.apprenticeship.descent import Fit, Problem, fit_in_program, fit_on_host
 from jaxhom.apprenticeship.learned import Learned
-from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.demonstrations import Demonstrations, require_demonstrations
 from jaxhom.models.inputs import as_model, require_features
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.occupancy import feature_expectations
 from jaxhom.planning.optimal import optimal_policy
 from jaxhom.planning.soft_optimal import soft_optimal_policy
+from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -84,8 +86,9 @@ def max_causal_entropy(
       that it is within it. The likelihood is not quite convex where chance plays a part: a minimum may be a local one.
 
     Raises:
-      ValueError: unless one of demonstrations and expectations is given; on wrong shapes, a model without features,
-        negative penalties, demonstrations without a decision, initial weights that are negative where they must not be.
+      ValueError: unless one of demonstrations and expectations is given; on wrong shapes, a model without features or
+        with such small ones that weights overflow, negative penalties, demonstrations without a decision, initial
+        weights that are negative where they must not be.
 
     Source: Ziebart, Bagnell and Dey 2010; Ziebart 2010, sections 5 and 6.
 
@@ -113,11 +116,13 @@ def max_causal_entropy(
         max_iterations=checks.require_count("max_iterations", max_iterations),
     )
     start = _start(mdp, initial_weights, scale, problem.nonnegative)
-    if optimizer is None and checks.is_at_hand(mdp, evidence, start):
-        fit = fit_on_host(mdp, features, evidence, start, problem, progress)
-    else:
-        fit = fit_in_program(mdp, features, evidence, start, problem, optimizer)
-    found = _learned(mdp, features, scale, fit)
+    on_host = optimizer is None and checks.is_at_hand(mdp, evidence, start)
+    with one_blas_thread() if on_host else contextlib.nullcontext():
+        if on_host:
+            fit = fit_on_host(mdp, features, evidence, start, problem, progress)
+        else:
+            fit = fit_in_program(mdp, features, evidence, start, problem, optimizer)
+        found = _learned(mdp, features, scale, fit)
     if not is_batch:
         xp = checks.arrays_of(found)
         found = jax.tree.map(lambda leaf: xp.asarray(leaf)[0], found)
@@ -135,9 +140,7 @@ def _evidence(mdp: MDP, demonstrations, expectations) -> tuple[Evidence, bool]:
         expectations = checked_expectations(mdp, expectations)
         is_batch = expectations.ndim == 2
         return Evidence(expectations=expectations if is_batch else expectations[None]), is_batch
-    if not isinstance(demonstrations, Demonstrations):
-        raise ValueError(f"demonstrations must be Demonstrations, got {type(demonstrations).__name__}")
-    demonstrations.validate(mdp, "warn")
+    require_demonstrations(demonstrations).validate(mdp, "warn")
     frequencies = frequencies_of(mdp, demonstrations)
     if not checks.is_traced(frequencies) and not np.asarray(frequencies).any():
         raise ValueError("demonstrations hold no decision: no step, or none outside absorbing states")
@@ -180,12 +183,15 @@ def _learned(mdp: MDP, features, scale, fit: Fit) -> Learned:
     scaled = xp.asarray(fit.weights).astype(mdp.dtype)
     reward = xp.einsum("sak,bk->bsa", xp.asarray(features), scaled).astype(mdp.dtype)
     soft, greedy = soft_optimal_policy(mdp, reward), optimal_policy(mdp, reward)
+    weights = (scaled / scale).astype(mdp.dtype)
+    if xp is np and not np.isfinite(weights).all():
+        raise ValueError(f"features are too small for weights in {mdp.dtype}: multiply them by a constant")
     statuses = xp.stack([xp.asarray(part) for part in (fit.status, soft.status, greedy.status)])
     is_first_bad = xp.argmax(statuses != Status.SOLVED, axis=0)
     return Learned(
         policy=soft.policy,
         greedy_policy=greedy.policy,
-        weights=(scaled / scale).astype(mdp.dtype),
+        weights=weights,
         expectations=feature_expectations(mdp, soft.policy),
         objective=xp.asarray(fit.objective).astype(mdp.dtype),
         gradient_norm=xp.asarray(fit.gradient_norm).astype(mdp.dtype),

@@ -133,15 +133,18 @@ def _rounds(sides: ExactSides, expectations: Float[np.ndarray, " K"], goal: floa
     responder.add(np.asarray(uniform_policy(sides.mdp), np.float64))
     shares, weights, bound = np.ones(1), np.zeros_like(expectations), -np.inf
     points = responder.pool.expected - expectations
+    unit = np.abs(points).max() or 1.0  # squares of numbers like 1e200 overflow, and those of 1e-200 are 0
+    points, goal = points / unit, goal / unit
     distance = np.linalg.norm(shares @ points)
     iterations, status = 0, Status.SOLVED if distance == 0 else Status.ITERATION_LIMIT
     while status == Status.ITERATION_LIMIT and iterations < limit:
         direction = -(shares @ points) / distance
         most, number = responder.respond(direction)
         iterations += 1
-        if direction @ expectations - most > bound:
-            bound, weights = direction @ expectations - most, direction
-        points = responder.pool.expected - expectations
+        proved = (direction @ expectations - most) / unit
+        if proved > bound:
+            bound, weights = proved, direction
+        points = (responder.pool.expected - expectations) / unit
         shares = np.append(shares, np.zeros(len(points) - len(shares)))
         mixed = mix(points, shares, number)
         before, after = distance, np.linalg.norm(mixed @ points)
@@ -161,6 +164,7 @@ def _certified(
     farthest = np.maximum(np.abs(expectations - outcome.low), np.abs(expectations - outcome.high))
     length = np.linalg.norm(outcome.weights.astype(np.float64))
     rounding = 1.0 + (len(expectations) + 8) * eps
-    distance = float(np.linalg.norm(farthest) * rounding + eps * np.abs(expectations).max())
+    size = farthest.max() or 1.0
+    distance = float(size * np.linalg.norm(farthest / size) * rounding + eps * np.abs(expectations).max())
     bound = max(0.0, -outcome.advantage / (length * rounding)) if length > 0 else 0.0
     return outcome.learned(distance, min(bound, distance), is_above=True)

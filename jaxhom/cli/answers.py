@@ -34,6 +34,7 @@ class Answers:
 
     Raises:
       FileError: naming the file's line and column if it holds no answers.
+      FileNotFoundError: if its folder is missing.
       ValueError: if the model has no optimal policy to answer.
     """
 
@@ -45,6 +46,8 @@ class Answers:
         self._actions: list[int] = []
         self.skipped = np.zeros(problem.mdp.num_states, bool)
         self.is_over = False
+        if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
+            raise FileNotFoundError(2, "no such folder", os.path.dirname(path))  # before somebody answers
         if path is not None and os.path.exists(path) and os.path.getsize(path):
             states, actions = answers_from_csv(path, mdp=problem.mdp)
             self._states, self._actions = states.tolist(), actions.tolist()
@@ -85,9 +88,9 @@ class Answers:
         allowed = np.flatnonzero(np.asarray(self._problem.mdp.allowed)[state]).tolist()
         while True:
             print(f"{question}, one of {', '.join(map(self._choice, allowed))}: ", end="", flush=True)
-            line = sys.stdin.readline()
+            line = sys.stdin.readline() if sys.stdin else ""  # which a closed one is not
             text = line.strip().lower()
-            if not sys.stdin.isatty():
+            if not _is_terminal():
                 print(text, flush=True)  # which a terminal has shown already
             if not line or text == _STOP:
                 self.is_over = True
@@ -97,13 +100,17 @@ class Answers:
             if number in allowed:
                 return number
             complaint = f"state {state}: {text!r} is no action that is allowed there"
-            if not sys.stdin.isatty():
+            if not _is_terminal():
                 raise ValueError(complaint)
             print(complaint)
 
     def _choice(self, action: int) -> str:
         name = self._names[action]
         return name if name == str(action) else f"{action} {name}"
+
+
+def _is_terminal() -> bool:
+    return bool(sys.stdin) and sys.stdin.isatty()
 
 
 def _number(text: str) -> int:

@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.apprenticeship.arguments import check_features
 from jaxhom.apprenticeship.exact import rounded_down
 from jaxhom.guarantees import all_time, first_steps
 from jaxhom.guarantees.choices import Choices, Found
@@ -116,8 +117,8 @@ def loss_bound(
       float32 1e-7 / (1 - discount).
 
     Raises:
-      ValueError: if the model has no features, a demonstration does not fit it, `policy` or `weights` have another
-        shape or are none, `horizon` is below 1, or anything is traced.
+      ValueError: if the model has no features, or such that their sums over time overflow, a demonstration does not
+        fit it, `policy` or `weights` have another shape or are none, `horizon` is below 1, or anything is traced.
 
     Warns:
       ImpossibleStepsWarning: if steps have probability 0; see `Demonstrations.validate`.
@@ -150,11 +151,12 @@ def loss_bound(
 
 
 def concrete_problem(name: str, mdp: Any, *given: Any) -> MDP:
-    """The model, or `ValueError` if it has no features, or if it or what else is given to the function is traced."""
+    """The model, or `ValueError` if it has none or too large features, or if it or what else is given is traced."""
     mdp = as_model(mdp)
     if checks.is_traced(mdp, *given):
         raise ValueError(f"{name} plans on the host: call it outside jit, vmap and grad")
     require_features(mdp)
+    check_features(mdp)
     return mdp
 
 

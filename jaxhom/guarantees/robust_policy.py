@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.apprenticeship.lpal import lpal
+from jaxhom.apprenticeship.presolve import Reach, default_tolerance, reduce_expectations
 from jaxhom.guarantees.loss_bound import Agreeing, LossBound, concrete_problem
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
@@ -23,6 +24,8 @@ from jaxhom.status import Record, Status
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float, Int
+
+_LEEWAY = 1.1  # of the tolerance: what is computed twice differs in its last digits
 
 
 class RobustPolicy(Record):
@@ -35,7 +38,8 @@ class RobustPolicy(Record):
         certificate.
       weights: [K], non-negative, sum 1: the reward that proves `least_loss`, the worst one against all policies.
       iterations: int32 scalar, those of LPAL.
-      status: int32 scalar, a `jaxhom.Status`: that of LPAL, or of the planning for U where that was not solved.
+      status: int32 scalar, a `jaxhom.Status`: that of LPAL, or of the planning for U where that was not solved; STALLED
+        where rounding leaves the certificate wider than what was asked for.
     """
 
     policy: Float[Array, "S A"]
@@ -66,8 +70,7 @@ def robust_policy(
     Args:
       mdp: the model, with K >= 1 features.
       demonstrations: the expert's trajectories, as for `loss_bound`.
-      tolerance: largest `loss.bound - least_loss` to settle for, up to what planning and rounding leave open; by
-        default that of `lpal`.
+      tolerance: largest `loss.bound - least_loss` to settle for; by default that of `lpal`.
       method: of `lpal`.
       max_iterations: of `lpal`; `status` is then ITERATION_LIMIT.
 
@@ -97,15 +100,26 @@ def robust_policy(
     mdp = concrete_problem("robust_policy", mdp, demonstrations)
     with checks.at_once(), one_blas_thread():
         agreeing = Agreeing(mdp, demonstrations)
-        options = {"tolerance": tolerance, "method": method, "max_iterations": max_iterations}
-        solution = lpal(mdp, agreeing.optima, **options)
+        if tolerance is None:
+            tolerance = _default_tolerance(mdp, np.asarray(agreeing.optima))
+        solution = lpal(mdp, agreeing.optima, tolerance=tolerance, method=method, max_iterations=max_iterations)
         least = -np.asarray(solution.margin_bound)
-        is_planned = agreeing.status == Status.SOLVED
+        loss = agreeing.loss(np.asarray(solution.policy), None)
+        status = agreeing.status if agreeing.status != Status.SOLVED else int(solution.status)
+        # LPAL has its own rounding to answer for; to that the rounding of U and of the loss are added.
+        if status == Status.SOLVED and float(loss.bound) - float(least) > _LEEWAY * tolerance:
+            status = Status.STALLED
         return RobustPolicy(
             policy=solution.policy,
-            loss=agreeing.loss(np.asarray(solution.policy), None),
+            loss=loss,
             least_loss=checks.to_device(least),
             weights=solution.weights,
             iterations=solution.iterations,
-            status=solution.status if is_planned else checks.to_device(agreeing.status, np.int32),
+            status=checks.to_device(status, np.int32),
         )
+
+
+def _default_tolerance(mdp: MDP, optima: Float[np.ndarray, " K"]) -> float:
+    """That of `lpal`."""
+    reach = Reach.of(mdp)
+    return float(default_tolerance(reach, reduce_expectations(reach, optima[None].astype(np.float64)))[0])

@@ -199,6 +199,14 @@ class Demonstrations(Record):
             checks.require_all("actions", actions, exists | ~mask, message)
 
 
+def require_demonstrations(demonstrations: Any) -> Demonstrations:
+    """Returns the demonstrations; raises if they are something else, such as a list of trajectories."""
+    if not isinstance(demonstrations, Demonstrations):
+        kind = type(demonstrations).__name__
+        raise ValueError(f"demonstrations must be Demonstrations, got {kind}: see Demonstrations.from_trajectories")
+    return demonstrations
+
+
 def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[Bool[Array, " S"], Float[Array, "S A"]]:
     """Frequencies of the expert's actions in the states that were demonstrated.
 
@@ -233,7 +241,7 @@ def empirical_policy(mdp: MDP, demonstrations: Demonstrations) -> tuple[Bool[Arr
     Source: Boularias and Chaib-draa 2010, section V.
     """
     mdp = as_model(mdp)
-    demonstrations.validate(mdp, "warn")
+    require_demonstrations(demonstrations).validate(mdp, "warn")
     counts = action_counts(mdp, demonstrations)
     xp = checks.arrays_of(mdp, counts)
     visits = counts.sum(axis=-1, keepdims=True)
@@ -289,7 +297,7 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
     Source: Boularias and Chaib-draa 2010, eq. (6), with the first step counted as gamma^0.
     """
     mdp = as_model(mdp)
-    demonstrations.validate(mdp, "warn")
+    require_demonstrations(demonstrations).validate(mdp, "warn")
     if not checks.is_traced(demonstrations.is_answer) and np.asarray(demonstrations.is_answer).all():
         raise ValueError("all trajectories are answers about single states, which say nothing of time")
     is_little = checks.is_at_hand(mdp, demonstrations)  # the sums take less time than any program compiles

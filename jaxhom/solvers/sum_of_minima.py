@@ -83,6 +83,9 @@ class SumOfMinima:
             return np.zeros(count), self._bound(np.zeros(len(right)))
         parts = result.x[: len(cost) - groups].reshape(len(signs), count)
         weights = self.largest * np.clip(np.array(signs) @ parts, 0.0 if self.nonnegative else -1.0, 1.0)
+        # Twice the weights are worth twice as much: the best are 0, or at the box's wall. What is neither is slack.
+        if np.abs(weights).max(initial=0.0) < 0.5 * self.largest:
+            weights = np.zeros(count)
         return weights, self._bound(np.maximum(-result.ineqlin.marginals, 0.0))
 
     def _bound(self, multipliers: Float[np.ndarray, " N"]) -> float:

@@ -285,3 +285,11 @@ def test_actions_that_are_not_allowed_and_models_that_do_not_do(monkeypatch):
     monkeypatch.setattr("jaxhom.apprenticeship.inverse_lp._MOST_NUMBERS", 10)
     with pytest.raises(ValueError, match="6 x 3 x 3 numbers"):
         inverse_lp(small_model(), [0] * 6)
+
+
+def test_slack_alone_makes_no_reward():
+    """No reward of three regions explains always going up: what the slack would allow is not taken for one."""
+    grid = jaxhom.gridworld(3, num_regions=9, discount=0.9).mdp
+    mdp = grid.replace(features=np.asarray(grid.features)[..., [2, 5, 8]])
+    learned = jaxhom.inverse_lp(mdp, np.zeros(9, int))
+    assert (learned.weights == 0).all() and learned.objective == 0

@@ -269,3 +269,12 @@ def test_from_demonstrations():
     learned = projection(mdp, expectations, method="max_margin")
     assert_certified(learned, mdp, expectations)
     assert learned.status == Status.SOLVED and learned.bound > 10  # sums of few steps are far from what policies have
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e200])
+def test_squares_that_no_number_holds(size):
+    mdp = gridworld(3, num_regions=9, discount=0.9).mdp
+    one = projection(mdp, np.zeros(9))
+    other = projection(mdp.replace(features=size * np.asarray(mdp.features)), np.zeros(9))
+    np.testing.assert_allclose(other.objective, size * one.objective, rtol=1e-6)
+    assert 0 < other.bound <= other.objective and other.status == Status.SOLVED

@@ -181,6 +181,7 @@ REFUSED = {
     "unknown state": (["--answers", "far.csv"], "far.csv line 3, column 'state': must lie in [0, 16), got 16"),
     "unknown action": (["--answers", "act.csv"], "act.csv line 2, column 'action': must lie in [0, 4), got 4"),
     "no column": (["--answers", "none.csv"], "none.csv line 1: column 'action' is missing"),
+    "no folder": (["--answers", "missing/said.csv"], "missing: no such folder"),
     "no features, loss": (["--until-loss", "1"], "--until-loss needs features"),
     "no features, bound": (["--criterion", "bound"], "--criterion bound needs features"),
     "nan": (["--until-loss", "nan"], "--until-loss must be a number"),
@@ -209,6 +210,12 @@ def test_what_standard_input_says_wrong_is_one_line(files, monkeypatch, capsys):
     assert main(["ask", *files.options(), *PLAIN]) == 2
     assert "'4' is no action that is allowed there" in capsys.readouterr().err
     assert len(files["out/answers.csv"].read_text().splitlines()) == 2  # the first one is kept
+
+
+def test_a_closed_standard_input_answers_nothing(files, monkeypatch):
+    monkeypatch.setattr("sys.stdin", None)
+    assert main(["ask", *files.options(), *PLAIN]) == 0
+    assert [row["answers"] for row in files.report()["rounds"]] == [0]
 
 
 def test_a_single_trajectory_has_no_likelihood(files, capsys):

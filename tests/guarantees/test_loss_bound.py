@@ -394,12 +394,21 @@ def test_demonstrations_of_another_model_warn():
         ({"weights": [1.0, np.nan, 0.0]}, r"weights\[1\] must be finite"),
         ({"horizon": 0}, "horizon must be at least 1"),
         ({"horizon": 2.5}, "horizon must be a whole number"),
+        ({"demonstrations": [([0], [0])]}, "demonstrations must be Demonstrations, got list"),
     ],
 )
 def test_refuses(changes, message):
     arguments = {"mdp": small().mdp, "demonstrations": small().demonstrations, "policy": small().policy} | changes
     with pytest.raises(ValueError, match=message):
         loss_bound(**arguments)
+
+
+@pytest.mark.parametrize("horizon", [None, 5])
+def test_features_whose_sums_overflow_are_refused(horizon):
+    given = small()
+    features = np.full(given.mdp.features.shape, 1e308)
+    with pytest.raises(ValueError, match="too large for sums over time"):
+        loss_bound(given.mdp.replace(features=features), given.demonstrations, given.policy, horizon=horizon)
 
 
 def test_concrete_values_inside_a_program_are_constants():

@@ -232,9 +232,12 @@ def _changes_of(mdp: MDP, policy, visits, states, values, xp: ModuleType):
 
 
 def _values(mdp: MDP, policy, rewards):
-    """V [B, S] of one policy for rewards [B, S, A]; on the host by one factorisation where that is quick."""
-    if checks.is_at_hand(mdp, policy, rewards) and host_model(mdp).is_soon_factorised:
-        return host_model(mdp).chain(policy).value((policy * rewards).sum(axis=-1, dtype=np.float64).T).T
+    """V [B, S] of one policy for rewards [B, S, A]; on the host from one chain, where that gets there."""
+    if checks.is_at_hand(mdp, policy, rewards):
+        chain = host_model(mdp).chain(policy, may_iterate=True)
+        values = chain.value((policy * rewards).sum(axis=-1, dtype=np.float64).T).T
+        if np.isfinite(values).all():
+            return values
     if not isinstance(rewards, np.ndarray):
         return policy_value(mdp, jnp.broadcast_to(policy, rewards.shape), rewards)
     lanes = len(rewards)

@@ -4,6 +4,7 @@ The draws of a setting go through the solvers in batches of one size, so that fe
 fails is tried draw by draw; a draw that fails is a row with its error, and the sweep goes on.
 """
 
+import contextlib
 import dataclasses
 import sys
 import threading
@@ -26,6 +27,8 @@ from jaxhom import Status
 
 BATCH = 50  # draws: all of a point of Figure 1, and half of a row of Table I
 _NUM_TRIALS = 1000  # as many as the paper's
+_BY_LAPACK = threading.Lock()  # small models are solved by LAPACK inside XLA: two such programs at a time can hang
+_SMALL = 64  # states
 _BAR = "{desc}{percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
 
 
@@ -58,10 +61,13 @@ class _Task:
     @property
     def work(self) -> int:
         """A rough measure of a method's cost: states times missing draws, the compiler's share included."""
-        domain = self.setting.domain
-        size = domain.lstrip("abcdefghijklmnopqrstuvwxyz_")  # of grids and lakes
-        num_states = int(size) ** 2 if size else 5000
-        return (num_states + 500) * len(self.draws)
+        return (self.num_states + 500) * len(self.draws)
+
+    @property
+    def num_states(self) -> int:
+        """About: of grids and lakes their size says it."""
+        size = self.setting.domain.lstrip("abcdefghijklmnopqrstuvwxyz_")
+        return int(size) ** 2 if size else 5000
 
 
 def run(sweep: Sweep, file: RowFile, *, retry: bool = False, workers: int = 2) -> None:
@@ -133,8 +139,9 @@ def _compute(sweep: Sweep, task: _Task) -> Iterator[list[Row]]:
             return [result for draw in draws for result in results(method, (draw,))]
 
     for name, blanks in task.missing.items():
-        start = time.perf_counter()
-        found = dict(zip(task.draws, results(sweep.methods[name], task.draws), strict=True))
+        with _BY_LAPACK if task.num_states <= _SMALL else contextlib.nullcontext():
+            start = time.perf_counter()
+            found = dict(zip(task.draws, results(sweep.methods[name], task.draws), strict=True))
         shared = {"seconds": (time.perf_counter() - start) / len(task.draws)}
         shared |= provenance("jax", "jaxlib", "numpy", "scipy")
         yield [dataclasses.replace(blank, **found[blank.draw], **shared) for blank in blanks]

@@ -241,10 +241,10 @@ def _apprentices(setting: _Setting, name: str, policies: jax.Array) -> _Policies
 def _fed_with_zeros(setting: _Setting) -> _Policies:
     """The control of LPAL: no demonstration, and so one policy for all sets."""
     mdp, sets = setting.problem.mdp, len(setting.demonstrations)
-    solution = lpal(mdp, jnp.zeros(mdp.num_features))
+    solution = lpal(mdp, jnp.zeros((1, mdp.num_features)))
     gap = jnp.maximum(solution.margin_bound - solution.margin, 0.0) * (1.0 - mdp.discount)
-    policy = jnp.broadcast_to(solution.policy, (sets, *solution.policy.shape))
-    return _Policies(CONTROL, policy, jnp.full(sets, gap), [solution])
+    policy = jnp.broadcast_to(solution.policy, (sets, *solution.policy.shape[1:]))
+    return _Policies(CONTROL, policy, jnp.broadcast_to(gap, sets), [solution])
 
 
 def _measurer(setting: _Setting) -> Callable[[_Policies], Row]:

@@ -59,7 +59,9 @@ def replace_method(monkeypatch, name, function):
 def quick_methods(monkeypatch):
     """The job's table and picture without its long computations."""
 
-    def lpal(mdp, expectations, *, initial_policy):
+    def lpal(mdp, expectations, *, initial_policy=None):
+        if initial_policy is None:
+            initial_policy = np.full((1, *mdp.allowed.shape), 1.0 / mdp.num_actions)
         fields = dict.fromkeys(("occupancy", "weights", "iterations", "status"))
         return LPALSolution(policy=initial_policy, margin=np.ones(1), margin_bound=np.full(1, 1.5), **fields)
 
@@ -73,7 +75,8 @@ def test_main_job_prints_its_table(in_folder, monkeypatch, capsys):
     quick_methods(monkeypatch)
     assert main([*SMALL, "--track", "a.track", "--picture", "policies.png", "--seed", "1", "--progress"]) == 0
     written = capsys.readouterr()
-    for name in ("expert", "soft local homomorphism", "soft local homomorphism + LPAL", "k-NN (hops)"):
+    learned = ("soft local homomorphism", "soft local homomorphism + LPAL", "k-NN (hops)", "LPAL, fed with zeros")
+    for name in ("expert", *learned):
         assert written.out.count(f"\n  {name}  ") == 2
     assert "gridworld 2x2, 1 regions" in written.out and "racetrack (a.track), 1 demonstrations" in written.out
     lines = written.out.splitlines()
@@ -105,8 +108,9 @@ def test_main_job_says_what_did_not_end_as_asked(in_folder, monkeypatch, capsys)
     assert main([*SMALL, "--track", "a.track", "--picture", ""]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
-        f"jaxhom: warning: {title}, soft local homomorphism + LPAL: {Status.ITERATION_LIMIT.message}"
+        f"jaxhom: warning: {title}, {name}: {Status.ITERATION_LIMIT.message}"
         for title in ("gridworld 2x2, 1 regions, 10 demonstrations", "racetrack (a.track), 1 demonstrations")
+        for name in ("soft local homomorphism + LPAL", "LPAL, fed with zeros")
     ]
 
 

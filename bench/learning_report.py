@@ -49,6 +49,7 @@ _LOSSES = {
     (f"robust policy, {WORST}", "certificate"): ("robust policy: bound over all weights", BLUE, "s", "-"),
     (f"max. causal entropy, {TRUE}", "certificate"): ("max. causal entropy: at the true weights", GREEN, "v", "-."),
 }
+_LEAST_SHOWN = 1e-4  # loss per step, on a logarithmic scale
 _KINDS = {
     "no demonstration": tuple(CONTROLS),
     "generalization": ("k-NN", "Algorithm 1"),
@@ -106,9 +107,9 @@ def guarantees_figure(lines: pd.DataFrame) -> Figure:
     for domain, ax in zip(domains, panels.flat, strict=True):
         for (method, metric), style in _LOSSES.items():
             here = pick(lines, domain=domain, method=method, metric=metric)
-            here = here[here["mean"] > 1e-7]  # nothing is lost: no point on a logarithmic scale
+            here = here[here["mean"] > _LEAST_SHOWN]
             if len(here):
-                draw_curve(ax, here.assign(ci_low=here["ci_low"].clip(lower=1e-7)), "demonstrations", *style)
+                draw_curve(ax, here.assign(ci_low=here["ci_low"].clip(lower=_LEAST_SHOWN)), "demonstrations", *style)
         ax.set(yscale="log", xlabel="demonstrations", ylabel="loss per step" if ax is panels.flat[0] else "")
         ax.set_title(domain_name(domain), loc="left", fontsize="medium")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))

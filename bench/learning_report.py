@@ -153,7 +153,7 @@ def queries_figure(lines: pd.DataFrame) -> Figure:
         for choice, style in _CURVES.items():
             draw_curve(ax, rounds_of(here, choice), "round", *style)
         ax.set(xlabel="round", ylabel="reward per step / expert's" if ax in panels[:, 0] else "")
-        ax.set_title(f"{domain_name(domain)}, {count} demonstrations", loc="left", fontsize="small")
+        ax.set_title(f"{domain_name(domain)}\n{count} demonstrations", loc="left", fontsize="small")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.spines[["top", "right"]].set_visible(False)
         ax.grid(color="#DDDDDD", linewidth=0.6)

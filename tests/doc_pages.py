@@ -122,7 +122,7 @@ def _run_command(line: str) -> None:
         from bench import reproduce
 
         reproduce.parser().parse_args(words[3:])  # the sweeps take minutes: their own tests run them
-    elif words and words != ["python", "-m", "bench.report"]:
+    elif words and words not in (["python", "-m", "bench.report"], ["python", "-m", "bench.critical_states"]):
         _require_installs(line)
 
 

@@ -83,9 +83,9 @@ class HostObjective:
     def __call__(self, weights: Float[np.ndarray, " K"]) -> tuple[float, Float[np.ndarray, " K"]]:
         """The objective and its gradient."""
         reward = self._features @ weights
+        residual = _RESIDUAL * (1.0 + np.abs(reward).max())
         if self._missing is not None:
             reward = np.where(self._missing, -np.inf, reward)
-        residual = _RESIDUAL * (1.0 + np.abs(self._features @ weights).max())
         found = soft_values_on_host(self._model, reward, self._value, 1.0, residual, _MAX_STEPS, self._chain)
         self._value, chain = found.value, self._model.chain(found.policy, may_iterate=True)
         pairs = chain.flow(self._source)[:, None] * found.policy

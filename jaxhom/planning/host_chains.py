@@ -215,7 +215,7 @@ class HostChain:
     def _checked(self, right: np.ndarray, is_flow: bool, error: float) -> np.ndarray:
         if self._by_products:
             solution = self._iterate(right, is_flow, error)
-            if self._is_within(error, right, solution, is_flow) or not self._may_factorise:
+            if np.isfinite(solution).all() or not self._may_factorise:
                 return solution
         solution = self._solve(right, is_flow)
         return solution if self._is_within(_GOOD_ENOUGH, right, solution, is_flow) else np.full_like(solution, np.nan)

@@ -146,7 +146,7 @@ def _plan_at_hand(mdp: MDP, reward, value, tolerance, *, max_iterations: int, is
     if is_polished and max_iterations > 0 and model.plans_sooner(lanes):
         expected = [model.expected_next_value(lane) for lane in value.T]
         start = host_reward + model.discount * np.stack(expected, axis=-1)
-        return _improve_on_host(model, host_reward, _empty_plan(mdp, lanes), start, np.arange(lanes), max_iterations)
+        return _improve_on_host(model, host_reward, empty_plan(mdp, lanes), start, np.arange(lanes), max_iterations)
     plan, is_open = plan_in_program(mdp, reward, value, tolerance, max_iterations=max_iterations, is_quick=True)
     is_slow, is_open = np.asarray(plan.status) == Status.STALLED, np.asarray(is_open)
     if not (is_slow.any() or (is_polished and is_open.any())):
@@ -159,7 +159,7 @@ def _plan_at_hand(mdp: MDP, reward, value, tolerance, *, max_iterations: int, is
     return _improve_on_host(model, host_reward, plan, start, left, max_iterations)
 
 
-def _empty_plan(mdp: MDP, lanes: int) -> Plan:
+def empty_plan(mdp: MDP, lanes: int) -> Plan:
     """A plan of `lanes` rewards of which nothing is known."""
     pairs = (lanes, *mdp.allowed.shape)
     zeros, count = np.zeros(pairs, mdp.dtype), np.zeros(lanes, np.int32)

@@ -29,7 +29,7 @@ from jaxhom.models.mdp import MDP, expected_next_value
 from jaxhom.planning.chain_solver import solve_chain
 from jaxhom.planning.host_chains import HostChain, HostModel, host_model
 from jaxhom.planning.occupancy import policy_value
-from jaxhom.planning.optimal import reward_batch
+from jaxhom.planning.optimal import empty_plan, reward_batch
 from jaxhom.planning.plan import Plan
 from jaxhom.planning.plan_program import hidden_share
 from jaxhom.status import Status
@@ -159,7 +159,8 @@ def _plan_at_hand(mdp: MDP, reward: Float[np.ndarray, "B S A"], value, temperatu
     """The plan of concrete arrays: the host first where it is quick, and last for what the program could not do."""
     model = host_model(mdp)
     if len(reward) <= _FEW_LANES or model.solves_sooner(len(reward)):
-        left, plan = np.arange(len(reward)), _empty_plan(reward)
+        plan = jax.tree.map(np.array, empty_plan(mdp, len(reward)))
+        left = np.arange(len(reward))
     else:
         plan = _plan_in_program(mdp, reward, value, np.asarray(temperature, mdp.dtype), goal=goal)
         plan = jax.tree.map(np.array, plan)
@@ -176,14 +177,6 @@ def _plan_at_hand(mdp: MDP, reward: Float[np.ndarray, "B S A"], value, temperatu
         rounding = _rounding(found.value, mdp.dtype)
         plan.status[lane] = goal.status(np, plan.residual[lane], tolerance[lane], rounding, found.iterations)
     return plan
-
-
-def _empty_plan(reward: Float[np.ndarray, "B S A"]) -> Plan:
-    """A plan to be filled in."""
-    of_pairs, of_lanes = np.zeros_like(reward), np.zeros_like(reward[:, 0, 0])
-    count = of_lanes.astype(np.int32)
-    fields = {"policy": of_pairs, "value": of_pairs[..., 0], "action_value": of_pairs, "residual": of_lanes}
-    return Plan(**{name: array.copy() for name, array in fields.items()}, iterations=count, status=count.copy())
 
 
 class HostSoftValues(NamedTuple):

@@ -1,8 +1,8 @@
 """The best of some choices over all time, for every feature at once, and what each state adds to a loss.
 
-Sweeps are shared by all features: one product a sweep. They end soon where the graph mixes; where it does not, each
-feature goes on by policy iteration with direct solves (`jaxhom.planning.policy_iteration`). All of it in float64,
-whatever the model's type: the optimum of a feature is a bound, and a loss is a difference of such numbers.
+Every feature is planned for by policy iteration with direct solves (`jaxhom.planning.policy_iteration`) where these are
+quick; elsewhere by sweeps, which end soon where the graph mixes. All of it in float64, whatever the model's type: the
+optimum of a feature is a bound, and a loss is a difference of such numbers.
 
 A loss in states is by the performance difference lemma (Kakade and Langford 2002). For pi with occupancy mu and any
 other policy, of values V and Q,
@@ -12,35 +12,39 @@ other policy, of values V and Q,
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 
 from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.planning import policy_iteration
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Float, Int
 
 _EPS = float(np.finfo(np.float64).eps)
-_SWEEPS = 100  # before linear systems are solved, where that is quick; where it is not, as long as the span falls
-_SLOW, _MOST_SWEEPS = 0.5, 10_000  # to half of what it was after so many
+_SHARED_SWEEPS = 100  # before linear systems are solved
+_BLOCK = 15  # sweeps with the actions that were chosen, between two over all of them
+_LOOK_BACK, _SLOW = 8, 0.5  # after so many blocks a span that has not fallen to that of what it was counts as slow
+_MOST_BLOCKS, _LAST_SWEEPS = 1000, 100
 _DIRECT = 1e7  # states times bandwidth up to which a direct solve takes less than hundreds of sweeps
 _TOLERANCE, _ROUNDINGS = 1e-12, 8.0  # of what b may span: a share of the largest |feature|, and roundings of |V|
 
 
-def best(choices: Choices) -> Found:
-    """The best policy for each feature."""
-    value, is_open = _swept(choices)
-    actions, status = choices.backup(value, slice(None)).argmax(axis=1), Status.SOLVED
-    may_solve = choices.model.is_solvable
-    for k in np.flatnonzero(is_open):
-        plan = may_solve and policy_iteration.iterate(choices.model, choices.reward[..., k], actions[:, k], _EPS)
-        if plan:
-            value[:, k], actions[:, k] = plan.value, plan.actions
-        if not plan or not plan.is_settled:
-            status = Status.STALLED
+def best(choices: Choices, progress: bool = False) -> Found:
+    """The best policy for each feature, with a bar over features if `progress`."""
+    shape = len(choices.initial), len(choices.size)
+    value, status = np.zeros(shape), Status.SOLVED
+    for _ in range(_SHARED_SWEEPS if _is_direct(choices) else 0):  # one product for all features
+        value = choices.backup(value, slice(None)).max(axis=1)
+    actions = choices.backup(value, slice(None)).argmax(axis=1)
+    for k in tqdm(range(shape[1]), "features", disable=not progress):
+        reward = np.ascontiguousarray(choices.reward[..., k])
+        plan = _planned(choices, reward, choices.size[k], actions[:, k])
+        value[:, k], actions[:, k] = plan.value, plan.actions
+        status = status if plan.is_settled else Status.STALLED
     return _found(choices, value, actions, status)
 
 
@@ -76,23 +80,45 @@ def _found(choices: Choices, value, actions, status: int) -> Found:
     return Found(lower, upper, value, actions, int(status))
 
 
-def _swept(choices: Choices) -> tuple[Float[np.ndarray, "S K"], Bool[np.ndarray, " K"]]:
-    """Values after sweeps, shifted by the constant that halves what is open, and which features are still open."""
-    value, former = np.zeros((len(choices.initial), len(choices.size))), np.inf
-    shift = 0.5 * choices.discount / (1.0 - choices.discount)
-    for count in range(1, _MOST_SWEEPS + 1):
-        improved = choices.backup(value, slice(None)).max(axis=1)
-        change = improved - value
-        low, high = change.min(axis=0), change.max(axis=0)
-        value, span = improved + shift * (low + high), high - low
-        is_open = span > _TOLERANCE * choices.size + _ROUNDINGS * _EPS * np.abs(value).max(axis=0)
-        if not is_open.any():
-            break
-        if count % _SWEEPS == 0:
-            if _is_direct(choices) or (span > _SLOW * former)[is_open].any():
-                break
-            former = span
-    return value, is_open
+class _Planned(NamedTuple):
+    value: Float[np.ndarray, " S"]
+    actions: Int[np.ndarray, " S"]
+    is_settled: bool
+
+
+def _planned(choices: Choices, reward: Float[np.ndarray, "S A"], size: float, start: Int[np.ndarray, " S"]) -> _Planned:
+    """The best choices for one reward, of which `size` is the largest that can be met; `start` is where solves begin."""
+    swept = None if _is_direct(choices) else _swept(choices, reward, size)
+    if swept and (swept.is_settled or not choices.model.is_solvable):
+        return swept
+    plan = policy_iteration.iterate(choices.model, reward, swept.actions if swept else start, _EPS)
+    return _Planned(plan.value, plan.actions, plan.is_settled) if plan else swept or _swept(choices, reward, size)
+
+
+def _swept(choices: Choices, reward: Float[np.ndarray, "S A"], size: float) -> _Planned:
+    """Modified policy iteration: a sweep over all actions, then a block of sweeps with those that it chose.
+
+    Values are shifted by the constant that halves what is open (as in `planning.modified_policy_iteration`). Where the
+    span hardly falls, sweeps over all actions end it: blocks leave bounds that are further apart.
+    """
+    states, shift = np.arange(len(reward)), 0.5 * choices.discount / (1.0 - choices.discount)
+    value, former, blocks, left = np.zeros(len(reward)), np.inf, 0, _MOST_BLOCKS
+    while True:
+        action_value = reward + choices.discount * choices.model.expected_next_value(value)
+        actions = action_value.argmax(axis=1)
+        improved = action_value[states, actions]
+        low, high = (improved - value).min(), (improved - value).max()
+        value, span, left = improved + shift * (low + high), high - low, left - 1
+        is_settled = bool(span <= _TOLERANCE * size + _ROUNDINGS * _EPS * np.abs(value).max())
+        if is_settled or left <= 0:
+            return _Planned(value, actions, is_settled)
+        blocks += 1
+        if blocks % _LOOK_BACK == 0:
+            left, former = min(left, _LAST_SWEEPS) if span > _SLOW * former else left, span
+        if left > _LAST_SWEEPS:
+            chain, own = choices.leads(actions), reward[states, actions]
+            for _ in range(_BLOCK):
+                value = own + choices.discount * (chain @ value)
 
 
 def _is_direct(choices: Choices) -> bool:

@@ -90,6 +90,7 @@ def loss_bound(
     *,
     weights: Float[ArrayLike, " K"] | None = None,
     horizon: int | None = None,
+    progress: bool = False,
 ) -> LossBound:
     """Bounds how much less a policy is worth than the expert, whose reward is not known.
 
@@ -113,6 +114,7 @@ def loss_bound(
       horizon: H, to bound the loss over the first H steps, sums over t < H of gamma^t; for all time if None. The
         expert may then change its mind with time where it is not known, which stationary policies do not: the bound
         holds for both.
+      progress: show how many features have been planned for; for all time only.
 
     Returns:
       `LossBound`. Contributions sum to weights @ (V(pi_k) - V(policy)) or, without weights, to that of the worst
@@ -147,7 +149,7 @@ def loss_bound(
         checks.require_shape("policy", policy, "(B, S, A) with B >= 1", len(policy) > 0)
         weights = None if weights is None else _checked_weights(mdp, weights)
         horizon = None if horizon is None else checks.require_count("horizon", horizon)
-        agreeing = Agreeing(mdp, demonstrations, horizon)
+        agreeing = Agreeing(mdp, demonstrations, horizon, progress)
         lanes = [agreeing.loss(one, weights) for one in policy.reshape(-1, *policy.shape[-2:])]
         return (
             lanes[0] if policy.ndim == 2 else jax.tree.map(lambda *leaves: checks.to_device(np.stack(leaves)), *lanes)
@@ -173,12 +175,14 @@ class Agreeing:
       status: int, of the planning for U.
     """
 
-    def __init__(self, mdp: MDP, demonstrations: Demonstrations, horizon: int | None = None) -> None:
+    def __init__(
+        self, mdp: MDP, demonstrations: Demonstrations, horizon: int | None = None, progress: bool = False
+    ) -> None:
         self._mdp, self._horizon = mdp, horizon
         visited, self._expert = (np.asarray(array) for array in empirical_policy(mdp, demonstrations))
         self.agreed = np.asarray(deciding_states(mdp, visited))
         self._choices = Choices(mdp, self.agreed, self._expert)
-        self._best = self._plan(self._choices)
+        self._best = self._plan(self._choices, progress)
         self.optima = _rounded_up(self._best.upper, mdp.dtype)
         self.status = self._best.status
 
@@ -213,8 +217,10 @@ class Agreeing:
             state_names=self._mdp.state_names,
         )
 
-    def _plan(self, choices: Choices) -> Found:
-        return all_time.best(choices) if self._horizon is None else first_steps.best(choices, self._horizon)
+    def _plan(self, choices: Choices, progress: bool) -> Found:
+        if self._horizon is None:
+            return all_time.best(choices, progress)
+        return first_steps.best(choices, self._horizon)
 
     def _contributions(self, policy: Choices, own: Found, share: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
         if self._horizon is None:

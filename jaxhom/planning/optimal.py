@@ -153,7 +153,7 @@ def _plan_at_hand(mdp: MDP, reward, value, tolerance, *, max_iterations: int, is
         return plan
     if is_slow.any() and not model.is_solvable:
         return plan_in_program(mdp, reward, value, tolerance, max_iterations=max_iterations, is_quick=False)[0]
-    may_polish = is_polished and model.is_narrow and mdp.num_states <= _POLISHED_STATES
+    may_polish = is_polished and mdp.num_states <= _POLISHED_STATES and model.is_narrow
     left = np.flatnonzero(is_slow | (is_open & may_polish))
     start = np.moveaxis(np.asarray(plan.action_value), 0, -1)
     return _improve_on_host(model, host_reward, plan, start, left, max_iterations)

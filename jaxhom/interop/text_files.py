@@ -56,6 +56,17 @@ def open_text(path: str | os.PathLike, *, newline: str | None = None) -> Iterato
         raise FileError(f"{path}: {error.strerror or error}") from None
 
 
+@contextlib.contextmanager
+def errors_of(path: str | os.PathLike) -> Iterator[None]:
+    """Within it whatever is wrong with a file's contents, a `ValueError`, becomes a `FileError` that names the file."""
+    try:
+        yield
+    except FileError:
+        raise
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from None
+
+
 def without_gz(path: str | os.PathLike) -> str:
     """The path without the `.gz` that says that it is compressed: `walks.csv` of `walks.csv.gz`."""
     path = os.fspath(path)

@@ -133,7 +133,8 @@ def model_of_entries(
         initial=initial,
         features=features,
         allowed=None if exists.all() else exists,
-        **_names(state_names, action_names),
+        state_names=state_names,
+        action_names=action_names,
     )
     return ImportedModel(
         mdp=mdp,
@@ -145,14 +146,6 @@ def model_of_entries(
         moves=None if moves is None else tuple(moves),
         remarks=tuple(remarks),
     )
-
-
-def _names(state_names: Sequence[Hashable] | None, action_names: Sequence[Hashable] | None) -> dict[str, Any]:
-    import inspect
-
-    if "state_names" not in inspect.signature(MDP.from_successors).parameters:
-        return {}
-    return {"state_names": state_names, "action_names": action_names}
 
 
 def named(names: Sequence[Hashable] | None, number: int) -> str:

@@ -55,7 +55,7 @@ def from_cassandra(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | 
       ... R: push : shut : open : * 1
       ... ''')
       >>> door = from_cassandra(path)
-      >>> door.state_names, door.reward.round(2).tolist()
+      >>> door.state_names, np.asarray(door.reward, float).round(2).tolist()
       (('open', 'shut'), [[0.0, 0.0], [0.7, 0.0]])
     """
     statements = Statements(path)

@@ -2,7 +2,7 @@
 
     r(s, a) = sum_z T(s, a, z) r(s, a, z)        an expected reward per pair, which is all that values depend on
 
-*Ends.* A state without any action becomes absorbing, with reward 0: every action stays there. Where states have some
+*Ends.* A state without any action becomes absorbing, with reward and features 0: every action stays there. Where states have some
 actions and lack others, the latter are not allowed.
 
 *Sums.* Rows that miss 1 by no more than `MDP.from_successors` accepts are divided by their sums, and a remark says so.
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.domains.tile_map import TileMap
 from jaxhom.interop.successor_rows import checked_rows, model_of_rows, row_sums, rows_of_entries
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
@@ -36,8 +37,7 @@ class ImportedModel(Record):
       terminal: bool [S], states in which episodes have ended: they are absorbing; None if there are none.
       coordinates: float [S, D], positions of the states, for pictures and distances; None where they are unknown.
       labels: by name, bool [S]: what the source says of the states.
-      rows: the map, one text per row, where the states are its open cells; None without a map.
-      moves: per action its direction (down, right) on the map; None without a map.
+      domain: the model on its map, for pictures; None where there is no map.
       remarks: what was ignored or mended, in words.
     """
 
@@ -46,8 +46,7 @@ class ImportedModel(Record):
     terminal: Bool[np.ndarray, " S"] | None = None
     coordinates: Float[np.ndarray, "S D"] | None = None
     labels: dict[str, Bool[np.ndarray, " S"]] = dataclasses.field(default_factory=dict)
-    rows: tuple[str, ...] | None = dataclasses.field(default=None, metadata={"static": True})
-    moves: tuple[tuple[int, int], ...] | None = dataclasses.field(default=None, metadata={"static": True})
+    domain: TileMap | None = None
     remarks: tuple[str, ...] = dataclasses.field(default=(), metadata={"static": True})
 
     @property
@@ -90,8 +89,6 @@ def model_of_entries(
     action_names: Sequence[Hashable] | None = None,
     coordinates: Float[np.ndarray, "S D"] | None = None,
     labels: Mapping[str, Bool[np.ndarray, " S"]] | None = None,
-    rows: Sequence[str] | None = None,
-    moves: Sequence[tuple[int, int]] | None = None,
     remarks: Sequence[str] = (),
 ) -> ImportedModel:
     """Builds the model (see the module's text); pairs without entries are no actions.
@@ -122,6 +119,8 @@ def model_of_entries(
             loops, np.repeat(ends, num_actions), np.ones(len(loops), matrix.dtype), num_states, num_actions
         )
         matrix, exists = matrix + stay, exists | is_end[:, None]
+        if features is not None:
+            features = np.where(is_end.reshape(-1, *[1] * (np.ndim(features) - 1)), 0.0, features)
     if initial is None and is_end.any() and not is_end.all():
         initial = ~is_end / (~is_end).sum()
     if initial is not None:
@@ -142,8 +141,6 @@ def model_of_entries(
         terminal=is_end if is_end.any() else None,
         coordinates=coordinates,
         labels=dict(labels or {}),
-        rows=None if rows is None else tuple(rows),
-        moves=None if moves is None else tuple(moves),
         remarks=tuple(remarks),
     )
 
@@ -155,7 +152,7 @@ def named(names: Sequence[Hashable] | None, number: int) -> str:
 
 def counted(count: int, noun: str) -> str:
     """`1 state`, `2 states`."""
-    return f"{count} {noun}{'s' * (count != 1)}"
+    return f"{count} {noun}{'s' * bool(count != 1)}"
 
 
 def _remarks_on_sums(matrix: Any, exists: np.ndarray) -> list[str]:

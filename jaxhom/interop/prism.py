@@ -104,9 +104,9 @@ def _part(base: str, suffix: str) -> str | None:
 def _transitions(path: str) -> tuple[TextTable, bool, int]:
     """The rows behind the header, whether they have no choices, and the number of states where it is told."""
     table = TextTable.of_words(path)
-    if not table.rows:
+    if not len(table):
         raise FileError(f"{path}: it is empty")
-    header, rows = table.rows[0], table.after(1)
+    header, rows = table.row(0), table.after(1)
     kind = header[0].lower()
     if kind in ("ctmc", "ctmdp", "ma", "smg", "pomdp"):
         raise table.error(0, f"models of the kind {header[0]!r} are not read, only mdp and dtmc")
@@ -119,9 +119,10 @@ def _transitions(path: str) -> tuple[TextTable, bool, int]:
         is_chain, num_states, num_rows = len(header) == 2, int(header[0]), int(header[-1])
         if not 0 < num_states < _UNKNOWN:
             raise table.error(0, f"there must be one state at least, got {num_states}")
-    rows.require_width(4 - is_chain, 5 - is_chain, "state next probability" if is_chain else "state choice next probability")
-    if num_rows is not None and len(rows.rows) != num_rows:
-        raise FileError(f"{path}: {len(rows.rows)} transitions, but its first line says {num_rows}")
+    expected = "`state next probability`" if is_chain else "`state choice next probability`"
+    rows.require_width(4 - is_chain, 5 - is_chain, expected)
+    if num_rows is not None and len(rows) != num_rows:
+        raise FileError(f"{path}: {len(rows)} transitions, but its first line says {num_rows}")
     return rows, is_chain, num_states
 
 
@@ -129,15 +130,13 @@ def _actions(
     table: TextTable, state: np.ndarray, choice: np.ndarray, remarks: list[str]
 ) -> tuple[np.ndarray, list[str] | None]:
     """int [N] actions, and their names where labels can be these."""
-    labels = [fields[4] if len(fields) == 5 else None for fields in table.rows]
-    if not any(labels):
+    if not (table.widths == 5).any():
         return choice, None
-    names, numbers = numbered(labels)
-    action = np.array([numbers[label] for label in labels])
+    names, action = numbered(table.columns[4])
     by_choice = {*zip(state.tolist(), choice.tolist(), action.tolist(), strict=True)}
     choices = {*zip(state.tolist(), choice.tolist(), strict=True)}
     by_label = {*zip(state.tolist(), action.tolist(), strict=True)}
-    if None in names or not len(by_choice) == len(choices) == len(by_label):
+    if "" in names or not len(by_choice) == len(choices) == len(by_label):
         remarks.append("choices are numbered: their labels are not one for each choice of a state")
         return choice, None
     return action, names
@@ -207,13 +206,13 @@ def _reward(base: str, entries: Entries, num_states: int, is_chain: bool, remark
         remarks.append("the first of several reward structures is used")
     reward = np.zeros(len(entries.state))
     if (path := _part(name, ".srew")) is not None:
-        table = _rewards(path, 2, num_states, "state reward")
+        table = _rewards(path, 2, num_states, "`state reward`")
         by_state = np.zeros(num_states)
         by_state[table.whole_numbers(0, "state", num_states)] = table.numbers(1, "reward")
         reward += by_state[entries.state]
     if (path := _part(name, ".trew")) is not None:
         width = 4 - is_chain
-        table = _rewards(path, width, num_states, "state next reward" if is_chain else "state choice next reward")
+        table = _rewards(path, width, num_states, "`state next reward`" if is_chain else "`state choice next reward`")
         key = [table.whole_numbers(place, "number") for place in range(width - 1)]
         known = (entries.state, entries.next_state) if is_chain else (entries.state, entries.action, entries.next_state)
         places = {place: n for n, place in enumerate(zip(*(column.tolist() for column in known), strict=True))}
@@ -229,7 +228,7 @@ def _reward(base: str, entries: Entries, num_states: int, is_chain: bool, remark
 def _rewards(path: str, width: int, num_states: int, expected: str) -> TextTable:
     """The rows of a file of rewards behind its header, which begins with the number of states."""
     table = TextTable.of_words(path)
-    if not table.rows or table.rows[0][0] != str(num_states):
+    if not len(table) or table.row(0)[0] != str(num_states):
         raise FileError(f"{path}: the first line must begin with the number of states, {num_states}")
     rows = table.after(1)
     rows.require_width(width, width, expected)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
-import math
+import io
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from typing import NoReturn
 
 import numpy as np
 
 from jaxhom.interop.files import FileError
 from jaxhom.interop.text_files import open_text
+
+_END = "\N{OBJECT REPLACEMENT CHARACTER}"  # of a line, among words
+_CHUNK = 100_000  # lines that are split at once
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -21,24 +25,53 @@ class TextTable:
     Attributes:
       path: the file.
       lines: on which line each row stands.
-      rows: the fields of each.
+      columns: the fields, as texts; empty where a row has fewer than others.
+      widths: int [rows], how many fields each row has.
     """
 
     path: str | os.PathLike
     lines: list[int]
-    rows: list[list[str]]
+    columns: list[list[str]]
+    widths: np.ndarray
 
     @classmethod
-    def of_words(cls, path: str | os.PathLike, comment: str = "#") -> TextTable:
-        """Words with blanks between them, without blank lines and those that begin with `comment`."""
+    def of_words(cls, path: str | os.PathLike) -> TextTable:
+        """Words with blanks between them; without blank lines and comments, lines that begin with `#`."""
         with open_text(path) as file:
-            split = [line.split() for line in file]
-        kept = [n for n, words in enumerate(split) if words and not words[0].startswith(comment)]
-        return cls(path, [n + 1 for n in kept], [split[n] for n in kept])
+            stripped = [line.strip() for line in file]
+        kept = [number for number, line in enumerate(stripped, start=1) if line and line[0] != "#"]
+        columns, widths = _split([stripped[number - 1] for number in kept], None)
+        return cls(path, kept, columns, widths)
+
+    @classmethod
+    def of_separated(cls, path: str | os.PathLike) -> TextTable:
+        """Fields, some in quotes perhaps, with commas, semicolons or tabs between them, without blank lines.
+
+        Which it is is the one of which the first line has most.
+        """
+        with open_text(path, newline="") as file:
+            text = file.read()
+        separator = max(",;\t", key=text.partition("\n")[0].count)
+        if '"' in text:
+            lines, rows = _quoted(path, text, separator)
+            columns, widths = _filled_up(rows)
+            return cls(path, lines, columns, widths)
+        plain = text.splitlines()
+        kept = [number for number, line in enumerate(plain, start=1) if line.strip()]
+        columns, widths = _split([plain[number - 1] for number in kept], separator)
+        return cls(path, kept, columns, widths)
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def row(self, number: int) -> list[str]:
+        """The fields of one row."""
+        return [column[number] for column in self.columns[: self.widths[number]]]
 
     def after(self, count: int) -> TextTable:
         """The table without its first rows."""
-        return TextTable(self.path, self.lines[count:], self.rows[count:])
+        columns = [column[count:] for column in self.columns]
+        return TextTable(self.path, self.lines[count:], columns, self.widths[count:])
 
     def error(self, row: int, message: str) -> FileError:
         """What is wrong with a row."""
@@ -46,32 +79,29 @@ class TextTable:
 
     def require_width(self, least: int, most: int, expected: str) -> None:
         """Raises unless all rows have so many fields."""
-        for row, fields in enumerate(self.rows):
-            if not least <= len(fields) <= most:
-                raise self.error(row, f"expected `{expected}`, got {' '.join(fields)!r}")
-
-    def whole_numbers(self, place: int, name: str, upper: int = 2**31 - 1) -> np.ndarray:
-        """int [rows]: a column of whole numbers in [0, upper)."""
-        numbers = self._column(place, name, int, "a whole number")
-        wrong = (numbers < 0) | (numbers >= upper)
+        wrong = (self.widths < least) | (self.widths > most)
         if wrong.any():
-            self._refuse(int(np.argmax(wrong)), place, name, f"must lie in [0, {upper})")
+            row = int(np.argmax(wrong))
+            raise self.error(row, f"expected {expected}, got {' '.join(self.row(row))!r}")
+
+    def whole_numbers(self, place: int, name: str, upper: int = 2**31 - 1, lower: int = 0) -> np.ndarray:
+        """int [rows]: a column of whole numbers in [lower, upper)."""
+        numbers = self._numbers(place, name, int, "a whole number")
+        wrong = (numbers < lower) | (numbers >= upper)
+        if wrong.any():
+            self._refuse(int(np.argmax(wrong)), place, name, f"must lie in [{lower}, {upper})")
         return numbers
 
     def numbers(self, place: int, name: str) -> np.ndarray:
         """float [rows]: a column of finite numbers."""
-        numbers = self._column(place, name, float, "a number")
+        numbers = self._numbers(place, name, float, "a number")
         wrong = ~np.isfinite(numbers)
         if wrong.any():
             self._refuse(int(np.argmax(wrong)), place, name, "must be finite")
         return numbers
 
-    def texts(self, place: int) -> list[str]:
-        """A column as it stands."""
-        return [fields[place] for fields in self.rows]
-
-    def _column(self, place: int, name: str, kind: Callable, what: str) -> np.ndarray:
-        texts = self.texts(place)
+    def _numbers(self, place: int, name: str, kind: Callable, what: str) -> np.ndarray:
+        texts = self.columns[place] if self.columns else []
         try:
             return np.array([*map(kind, texts)], kind)
         except (ValueError, OverflowError):  # whole numbers of more than 64 bits are the latter
@@ -79,19 +109,55 @@ class TextTable:
             self._refuse(row, place, name, f"must be {what}")
 
     def _refuse(self, row: int, place: int, name: str, message: str) -> NoReturn:
-        raise self.error(row, f"{name} {message}, got {self.rows[row][place]!r}")
+        raise self.error(row, f"{name} {message}, got {self.columns[place][row]!r}")
+
+
+def numbered(values: Iterable[Hashable]) -> tuple[list, np.ndarray]:
+    """Different values in the order in which they come, and by number, int [N], what was given."""
+    numbers: dict[Hashable, int] = {}
+    which = [numbers.setdefault(value, len(numbers)) for value in values]
+    return [*numbers], np.array(which, int)
+
+
+def _split(lines: list[str], separator: str | None) -> tuple[list[list[str]], np.ndarray]:
+    """Columns and widths of lines; all lines of a chunk are split at once where they have equally many fields."""
+    width = len(lines[0].split(separator)) if lines else 0
+    columns: list[list[str]] = [[] for _ in range(width)]
+    end = f" {_END} " if separator is None else f"{separator}{_END}{separator}"
+    for first in range(0, len(lines), _CHUNK):
+        chunk = lines[first : first + _CHUNK]
+        fields = end.join(chunk).split(separator)
+        ends = fields[width :: width + 1]
+        if len(fields) != (width + 1) * len(chunk) - 1 or ends != [_END] * (len(chunk) - 1):
+            return _filled_up([line.split(separator) for line in lines])
+        for place, column in enumerate(columns):
+            column += fields[place :: width + 1]
+    return columns, np.full(len(lines), width)
+
+
+def _filled_up(rows: list[list[str]]) -> tuple[list[list[str]], np.ndarray]:
+    """Columns and widths of rows that may be of different lengths."""
+    widths = np.array([*map(len, rows)], int)
+    width = int(widths.max(initial=0))
+    return [[row[place] if place < len(row) else "" for row in rows] for place in range(width)], widths
+
+
+def _quoted(path: str | os.PathLike, text: str, separator: str) -> tuple[list[int], list[list[str]]]:
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+    lines, rows = [], []
+    try:
+        for row in reader:
+            if any(row):
+                lines.append(reader.line_num)
+                rows.append(row)
+    except csv.Error as error:
+        raise FileError(f"{path} line {reader.line_num}: {error}") from None
+    return lines, rows
 
 
 def _is(kind: Callable, text: str) -> bool:
     try:
-        return math.isinf(kind(text)) or abs(kind(text)) < 2**63 or kind is float
+        number = kind(text)
+        return kind is float or -(2**63) <= number < 2**63
     except ValueError:
         return False
-
-
-def numbered(values: Iterable) -> tuple[list, dict]:
-    """Different values in the order in which they come, and the number of each."""
-    numbers: dict = {}
-    for value in values:
-        numbers.setdefault(value, len(numbers))
-    return [*numbers], numbers

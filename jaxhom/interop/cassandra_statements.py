@@ -1,4 +1,4 @@
-"""The statements of Cassandra's format for MDPs and POMDPs, and tables in which later statements overwrite earlier ones.
+"""The statements of Cassandra's format for MDPs and POMDPs, and tables in which the last statement that fits counts.
 
     discount: 0.95                           states, actions, observations: their number or their names
     values: reward                           or cost
@@ -172,7 +172,7 @@ class Rules:
         given = (self.fields != WILD) @ (1 << np.arange(len(shape)))
         for pattern in np.unique(given):
             axes = np.flatnonzero(pattern >> np.arange(len(shape)) & 1)
-            sizes = [shape[axis] for axis in axes]
+            sizes = [shape[int(axis)] for axis in axes]
             (rules,) = np.nonzero(given == pattern)
             key, last = _last_of_each(_key(self.fields[rules][:, axes], sizes))
             wanted = _key(places[:, axes], sizes)
@@ -300,7 +300,7 @@ def _fewest_rules(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     wild = 0
     while wild < value.ndim and (value[..., :1] == value).all():
         value, wild = value[..., 0], wild + 1
-    places = np.indices(value.shape).reshape(value.ndim, -1).T
+    places = np.argwhere(np.ones(value.shape, bool))
     return np.pad(places, ((0, 0), (0, wild)), constant_values=WILD), value.ravel()
 
 

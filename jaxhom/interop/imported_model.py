@@ -2,8 +2,8 @@
 
     r(s, a) = sum_z T(s, a, z) r(s, a, z)        an expected reward per pair, which is all that values depend on
 
-*Ends.* A state without any action becomes absorbing, with reward and features 0: every action stays there. Where states have some
-actions and lack others, the latter are not allowed.
+*Ends.* A state without any action becomes absorbing, with reward and features 0: every action stays there. Where states
+have some actions and lack others, the latter are not allowed.
 
 *Sums.* Rows that miss 1 by no more than `MDP.from_successors` accepts are divided by their sums, and a remark says so.
 """
@@ -35,7 +35,7 @@ class ImportedModel(Record):
       mdp: the model.
       reward: float [S, A], expected reward of a step; None where the source has none.
       terminal: bool [S], states in which episodes have ended: they are absorbing; None if there are none.
-      coordinates: float [S, D], positions of the states, for pictures and distances; None where they are unknown.
+      coordinates: [S, D], positions of the states, for pictures and distances; None where they are unknown.
       labels: by name, bool [S]: what the source says of the states.
       domain: the model on its map, for pictures; None where there is no map.
       remarks: what was ignored or mended, in words.
@@ -44,7 +44,7 @@ class ImportedModel(Record):
     mdp: MDP
     reward: Float[Array, "S A"] | None = None
     terminal: Bool[np.ndarray, " S"] | None = None
-    coordinates: Float[np.ndarray, "S D"] | None = None
+    coordinates: Num[np.ndarray, "S D"] | None = None
     labels: dict[str, Bool[np.ndarray, " S"]] = dataclasses.field(default_factory=dict)
     domain: TileMap | None = None
     remarks: tuple[str, ...] = dataclasses.field(default=(), metadata={"static": True})
@@ -87,7 +87,7 @@ def model_of_entries(
     features: Float[np.ndarray, "..."] | None = None,
     state_names: Sequence[Hashable] | None = None,
     action_names: Sequence[Hashable] | None = None,
-    coordinates: Float[np.ndarray, "S D"] | None = None,
+    coordinates: Num[np.ndarray, "S D"] | None = None,
     labels: Mapping[str, Bool[np.ndarray, " S"]] | None = None,
     remarks: Sequence[str] = (),
 ) -> ImportedModel:
@@ -110,7 +110,7 @@ def model_of_entries(
     matrix = checked_rows(matrix, exists.ravel(), row_name)
     remarks = [*remarks, *_remarks_on_sums(matrix, exists)]
     reward = None if entries.reward is None else _expected(entries.reward, entries.probability, pair, exists)
-    is_end = ~exists.any(axis=1)
+    is_end = np.asarray(~exists.any(axis=1))
     if is_end.any():
         remarks.append(f"{counted(is_end.sum(), 'state')} without actions: absorbing")
         (ends,) = np.nonzero(is_end)

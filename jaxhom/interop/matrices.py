@@ -1,8 +1,7 @@
 """Models from matrices: the layout of the MDP toolboxes, and SciPy's sparse matrices.
 
 MDP toolboxes (Python, R, MATLAB) keep transitions action first, one S x S matrix per action. Sparse matrices are never
-made dense (`successor_rows`): a model whose rows are all short is small; one row with successors everywhere makes all of
-them long.
+made dense (see `successor_rows`).
 
 Rewards of a toolbox: [S] and [S, A] are what `optimal_policy` and `policy_value` take; [A, S, S], a reward per
 transition, becomes [S, A] by `numpy.einsum("asz,asz->sa", transitions, reward)`.

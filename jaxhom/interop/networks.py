@@ -12,6 +12,7 @@ non-negative weight on it prefers short ways.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -227,7 +228,9 @@ def _places(nodes: Sequence[Hashable], data: Sequence[dict]) -> np.ndarray | Non
         pairs = [tuple(attributes["pos"])[:2] for attributes in data]
     else:
         return None
-    return np.array([[_number(c, f"position of node {node!r}") for c in p] for node, p in zip(nodes, pairs, strict=True)])
+    return np.array(
+        [[_number(c, f"position of node {node!r}") for c in p] for node, p in zip(nodes, pairs, strict=True)]
+    )
 
 
 def _number(value: Any, name: str) -> float:
@@ -262,22 +265,16 @@ def _columns(path: str | os.PathLike) -> tuple[list, list, np.ndarray | None]:
     header = [text.strip().lower() for text in table.row(0)]
     found = [[place for place, name in enumerate(header) if name in names] for names in _HEADERS]
     if found[0] and found[1]:
-        begin, end, length = (places[0] if places else None for places in found)
         table = table.after(1)
-        table.require_width(len(header), len(header), f"{len(header)} fields")
     else:
         table.require_width(2, 3, "`from to` or `from to length`")
-        begin, end, length = 0, 1, 2 if (table.widths == 3).all() else None
-        table.require_width(*(len(header),) * 2, f"{len(header)} fields, as many as on the first line")
-    nodes = _whole_where_all_are(*([*map(str.strip, table.columns[place])] for place in (begin, end)))
-    for texts in nodes:
+        found = [[0], [1], [2] * (len(header) == 3)]
+    table.require_width(len(header), len(header), f"{len(header)} fields, as many as on the first line")
+    begin, end = found[0][0], found[1][0]
+    ends: list[list] = [[*map(str.strip, table.columns[place])] for place in (begin, end)]
+    for texts in ends:
         if "" in texts:
             raise table.error(texts.index(""), "a link must begin and end somewhere")
-    return *nodes, None if length is None else table.numbers(length, "length")
-
-
-def _whole_where_all_are(*columns: list) -> tuple[list, ...]:
-    try:
-        return tuple([*map(int, column)] for column in columns)
-    except ValueError:
-        return columns
+    with contextlib.suppress(ValueError):
+        ends = [[*map(int, texts)] for texts in ends]
+    return ends[0], ends[1], table.numbers(found[2][0], "length") if found[2] else None

@@ -7,8 +7,8 @@
     ..@.
 
 A move leads from ground to ground, or from water to water; a diagonal one cuts no corners: both cells beside it have to
-be passable as well. Moves that lead elsewhere are no actions. The feature of a move is its length with the sign changed,
--1 or -sqrt(2): a non-negative weight on it prefers short ways.
+be passable as well. Moves that lead elsewhere are no actions. The feature of a move is minus its length, -1 or
+-sqrt(2): a non-negative weight on it prefers short ways.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.interop.files import FileError
 from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries
-from jaxhom.interop.text_files import errors_of, open_text
+from jaxhom.interop.text_files import errors_of, open_text, require_letters
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Float
@@ -40,9 +40,7 @@ _MOVES = {
 }
 
 
-def from_octile(
-    path: str | os.PathLike, *, discount: Float[ArrayLike, ""] = 0.99, num_moves: int = 8
-) -> ImportedModel:
+def from_octile(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] = 0.99, num_moves: int = 8) -> ImportedModel:
     """Reads a grid map (see the module's text).
 
     Args:
@@ -68,8 +66,8 @@ def from_octile(
       >>> yard = from_octile(path)
       >>> yard.state_names
       ((0, 0), (0, 1), (1, 0), (1, 2))
-      >>> [[name for name, is_there in zip(yard.action_names, row) if is_there] for row in yard.mdp.allowed.tolist()[:3]]
-      [['south', 'east'], ['west'], ['north']]
+      >>> [yard.action_names[move] for move in yard.mdp.allowed[0].nonzero()[0]]
+      ['south', 'east']
     """
     if num_moves not in (4, 8):
         raise ValueError(f"num_moves must be 4 or 8, got {num_moves}")
@@ -92,7 +90,7 @@ def from_octile(
             features=np.broadcast_to(-length[:, None], (len(cells), num_moves, 1)),
             state_names=[*map(tuple, cells.tolist())],
             action_names=[*moves],
-            coordinates=cells.astype(float),
+            coordinates=cells,
             labels=labels,
             remarks=[f"{counted(mask.sum(), 'cell')} of {name}" for name, mask in labels.items()],
         )
@@ -125,9 +123,7 @@ def _map(path: str | os.PathLike) -> np.ndarray:
     for number, row in enumerate(rows, start=first + 2):
         if len(row) != size["width"]:
             raise FileError(f"{path} line {number}: {len(row)} columns, but the width is {size['width']}")
-        for column, letter in enumerate(row, start=1):
-            if letter not in _LETTERS:
-                raise FileError(f"{path} line {number}, column {column}: no letter {letter!r} among {''.join(_LETTERS)}")
+        require_letters(path, number, row, _LETTERS)
     return np.array([list(row) for row in rows])
 
 

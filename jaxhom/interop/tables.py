@@ -42,8 +42,8 @@ def from_table(
 
     Args:
       table: the path of a file with a line of names and one transition a line, its fields separated by commas,
-        semicolons or tabs, plain or compressed by gzip; or a data frame, or a mapping from names to columns; or integers
-        [S, A], the next state of each pair, -1 where there is no action, as an array or as a file without names.
+        semicolons or tabs, plain or compressed by gzip; or a data frame, or a mapping from names to columns; or
+        integers [S, A], the next state of each pair, -1 where there is no action, as an array or a file without names.
       discount: scalar, strictly between 0 and 1.
       columns: what the table calls `state`, `action`, `next_state`, `probability` and `reward`, where it is neither
         this nor one of the names above.
@@ -115,7 +115,9 @@ def _of_frame(frame: Any, discount, columns: dict[str, Hashable]) -> ImportedMod
     def values(name: str) -> np.ndarray | list[Hashable]:
         array = arrays[name]
         if array.dtype.kind in "iuf":
-            checks.require_all(f"column {name!r}", array, np.isfinite(array) & (array == np.floor(array)), "must be whole")
+            checks.require_all(
+                f"column {name!r}", array, np.isfinite(array) & (array == np.floor(array)), "must be whole"
+            )
             return array.astype(np.int64)
         missing = np.array([value is None or value != value for value in array.tolist()], bool)
         checks.require_all(f"column {name!r}", array, ~missing, "is missing")
@@ -180,9 +182,10 @@ def _of_columns(
 
 def _codes(*columns: np.ndarray | list[Hashable]) -> tuple[list, list[np.ndarray]]:
     """The different values of columns, ascending, and each column by their numbers."""
-    if all(isinstance(column, np.ndarray) for column in columns):
-        different, code = np.unique(np.concatenate(columns), return_inverse=True)
-        return different.tolist(), np.split(code, np.cumsum([len(column) for column in columns])[:-1])
+    whole = [column for column in columns if isinstance(column, np.ndarray)]
+    if len(whole) == len(columns):
+        different, code = np.unique(np.concatenate(whole), return_inverse=True)
+        return different.tolist(), np.split(code, np.cumsum([len(column) for column in whole])[:-1])
     texts = [[str(value) for value in column] for column in columns]
     names = sorted({text for column in texts for text in column})
     number = {name: n for n, name in enumerate(names)}

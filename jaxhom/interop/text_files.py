@@ -10,7 +10,7 @@ import gzip
 import io
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TextIO
 
 from jaxhom.interop.files import FileError
@@ -65,6 +65,13 @@ def errors_of(path: str | os.PathLike) -> Iterator[None]:
         raise
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
+
+
+def require_letters(path: str | os.PathLike, line: int, text: str, letters: Mapping[str, object]) -> None:
+    """Raises unless one line of a map is made of the letters."""
+    for column, letter in enumerate(text, start=1):
+        if letter not in letters:
+            raise FileError(f"{path} line {line}, column {column}: no letter {letter!r} among {''.join(letters)}")
 
 
 def without_gz(path: str | os.PathLike) -> str:

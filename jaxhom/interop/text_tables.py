@@ -6,7 +6,7 @@ import csv
 import dataclasses
 import io
 import os
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Hashable, Iterable
 from typing import NoReturn
 
 import numpy as np
@@ -100,10 +100,10 @@ class TextTable:
             self._refuse(int(np.argmax(wrong)), place, name, "must be finite")
         return numbers
 
-    def _numbers(self, place: int, name: str, kind: Callable, what: str) -> np.ndarray:
+    def _numbers(self, place: int, name: str, kind: type[int] | type[float], what: str) -> np.ndarray:
         texts = self.columns[place] if self.columns else []
         try:
-            return np.array([*map(kind, texts)], kind)
+            return np.array([kind(text) for text in texts], np.dtype(kind))
         except (ValueError, OverflowError):  # whole numbers of more than 64 bits are the latter
             row = next(row for row, text in enumerate(texts) if not _is(kind, text))
             self._refuse(row, place, name, f"must be {what}")
@@ -155,7 +155,7 @@ def _quoted(path: str | os.PathLike, text: str, separator: str) -> tuple[list[in
     return lines, rows
 
 
-def _is(kind: Callable, text: str) -> bool:
+def _is(kind: type[int] | type[float], text: str) -> bool:
     try:
         number = kind(text)
         return kind is float or -(2**63) <= number < 2**63

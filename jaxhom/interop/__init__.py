@@ -2,9 +2,8 @@
 
 * `from_gymnasium`, `make_environment`: an environment with a transition table, with its reward.
 * `from_mdptoolbox`, `from_scipy`: transition matrices.
-* `from_cassandra`, `from_prism`, `from_table`, `from_octile`, `from_gridworld`, `from_networkx`, `from_edges`: files and
-  objects of other people's models, as an `ImportedModel` with reward, names and remarks; `read_model` knows which by the
-  suffix.
+* `from_cassandra`, `from_prism`, `from_table`, `from_octile`, `from_gridworld`, `from_networkx`, `from_edges`: models
+  that others wrote, as an `ImportedModel` with reward, names and remarks; `read_model` chooses by a file's suffix.
 * `from_samples`: recorded transitions, with the uncertainty of each row.
 * `demonstrations_from_episodes`, `demonstrations_from_steps`, `demonstrations_from_csv`: trajectories of `imitation`,
   Minari, arrays and CSV files, with a report of what was dropped; `answers_from_csv`: answers about single states.

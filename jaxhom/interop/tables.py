@@ -196,7 +196,8 @@ def _of_next_states(table: np.ndarray, discount) -> ImportedModel:
     """The model of next states [S, A], -1 where there is no action."""
     good = table.ndim == 2 and table.size > 0
     checks.require_shape("table", table, "[S, A] (or it must have columns by name)", good)
-    whole = checks.require_integers("table + 1", np.asarray(table) + 1, upper=len(table) + 1) - 1
-    state, action = np.nonzero(whole >= 0)
-    entries = Entries(state, action, whole[state, action], np.ones(len(state)))
-    return model_of_entries(entries, num_states=len(whole), num_actions=whole.shape[1], discount=discount)
+    exists = checks.require_floats("table", table) != -1
+    next_state = checks.require_integers("table", np.where(exists, table, 0), upper=len(table))
+    state, action = np.nonzero(exists)
+    entries = Entries(state, action, next_state[state, action], np.ones(len(state)))
+    return model_of_entries(entries, num_states=len(table), num_actions=table.shape[1], discount=discount)

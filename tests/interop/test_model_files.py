@@ -49,9 +49,7 @@ def test_archives_hold_what_lies_beside_the_model(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.foo", "a", "a.npz.gz.foo", "a.gz"])
 def test_other_suffixes_are_refused(tmp_path, name):
-    with pytest.raises(
-        FileError, match=f"{name}: models are .npz, .pomdp, .mdp, .tra, .csv, .tsv, .map, .gw"
-    ):
+    with pytest.raises(FileError, match=f"{name}: models are .npz, .pomdp, .mdp, .tra, .csv, .tsv, .map, .gw"):
         read_model(tmp_path / name)
 
 

@@ -7,8 +7,8 @@
     R: action : state : next state : observation  r
 
 `*` stands for all; a number for the thing of that number, from 0 on. Where the last fields are missing, as many values
-follow as they have, row by row, or the words `uniform`, `identity` (rows or matrices of T) and `reset` (of T: back to
-the start). `#` begins a comment. A statement begins on a line of its own and ends where the next one begins.
+follow as they have, row by row, or `uniform`, or for T `identity` (a matrix) or `reset` (back to the start). `#` begins
+a comment. A statement begins on a line of its own and ends where the next one begins.
 """
 
 from __future__ import annotations
@@ -184,7 +184,9 @@ class Rules:
 
     def entries(self, shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Places [M, D], in ascending order, and values [M], of the entries of a table that are not 0."""
-        fields, value, time = self.fields, self.value, self.time
+        sets_row = self.fields[:, -1] == WILD
+        kept = ~sets_row | (self.value != 0)  # a table that is set to 0 first is not written out
+        fields, value, time = self.fields[kept], self.value[kept], self.time[kept]
         for axis, size in enumerate(shape):
             is_wild = fields[:, axis] == WILD
             times = np.where(is_wild, size, 1)
@@ -193,7 +195,8 @@ class Rules:
             fields, value, time = fields[rule], value[rule], time[rule]
             fields[:, axis] += np.where(is_wild[rule], place + 1, 0)  # WILD is -1
         cleared = np.full(shape[:-1], -1)
-        for when, leading in self.clears:
+        rows = zip(self.time[sets_row].tolist(), map(tuple, self.fields[sets_row, :-1].tolist()), strict=True)
+        for when, leading in sorted([*self.clears, *rows]):
             cleared[tuple(slice(None) if number == WILD else number for number in leading)] = when
         kept = time >= cleared[tuple(fields[:, :-1].T)]
         fields, value = fields[kept], value[kept]

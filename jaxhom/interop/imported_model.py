@@ -49,6 +49,9 @@ class ImportedModel(Record):
     domain: TileMap | None = None
     remarks: tuple[str, ...] = dataclasses.field(default=(), metadata={"static": True})
 
+    def _figures(self) -> dict[str, Any]:
+        return {name: value for name, value in super()._figures().items() if not (name == "labels" and not value)}
+
     @property
     def state_names(self) -> tuple[Hashable, ...] | None:
         """The names of the states; None where the source numbers them."""

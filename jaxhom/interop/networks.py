@@ -15,8 +15,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import os
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +25,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.interop.files import FileError
 from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
-from jaxhom.interop.text_files import errors_of, open_text
+from jaxhom.interop.text_files import errors_of, open_text, without_gz
 from jaxhom.interop.text_tables import TextTable, numbered
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 STATES = ("links", "nodes")
 _LENGTHS = ("length", "weight")
+_LOOK = 100  # lines, of which some may be comments, that show what a file is
 _HEADERS = (("u", "source", "from"), ("v", "target", "to"), _LENGTHS)
 
 
@@ -89,7 +91,8 @@ def from_edges(
     Args:
       path: a file of lines `from to`, or `from to length`, with blanks, commas, semicolons or tabs between them, plain
         or compressed by gzip. If the first line names columns, they may stand in any order: `u`, `source` or `from`;
-        `v`, `target` or `to`; `length` or `weight`; others are ignored. `.graphml` files are read by networkx.
+        `v`, `target` or `to`; `length` or `weight`; others are ignored. `.graphml` files, and lines
+        `from to {attributes}` as networkx writes them, are read by networkx.
       discount: scalar, strictly between 0 and 1.
       states: "links" or "nodes", as in `from_networkx`.
       directed: whether a line leads one way only; GraphML files say it themselves.
@@ -112,17 +115,17 @@ def from_edges(
       (((1, 2), (2, 3), (3, 1)), [-350.0, -120.0, -90.0])
     """
     with errors_of(path):
-        if os.fspath(path).lower().endswith((".graphml", ".graphml.gz")):
-            return from_networkx(_graphml(path), discount=discount, states=states)
+        graph = _read_by_networkx(path, directed)
+        if graph is not None:
+            return from_networkx(graph, discount=discount, states=states)
         begin, end, length = _columns(path)
         if not directed:
             begin, end = begin + end, end + begin
             length = None if length is None else np.tile(length, 2)
         nodes, which = numbered(begin + end)
         first, second = np.split(which, 2)
-        _, link = numbered(zip(begin, end, strict=True))
         names: list[tuple] = [*zip(begin, end, strict=True)]
-        if len(link) and link.max() + 1 < len(link):  # some are there several times
+        if len({*names}) < len(names):  # some are there several times
             times: dict[tuple, int] = {}
             for n, name in enumerate(names):
                 times[name] = times.get(name, -1) + 1
@@ -244,15 +247,32 @@ def _number(value: Any, name: str) -> float:
     return number
 
 
-def _graphml(path: str | os.PathLike) -> Any:
+def _read_by_networkx(path: str | os.PathLike, directed: bool) -> Any:
+    """The graph of a GraphML file, or of lines `from to {attributes}` as networkx writes them; None of other files."""
+    if without_gz(path).lower().endswith(".graphml"):
+        if not os.path.exists(path):
+            raise FileError(f"{path}: no such file")
+        return _by_networkx(path, "GraphML file", lambda networkx: networkx.read_graphml(path))
+    with open_text(path) as file:
+        lines = [line for line in itertools.islice(file, _LOOK) if line.strip() and not line.startswith("#")]
+        if not lines or not lines[0].rstrip().endswith("}"):
+            return None
+        lines += file
+
+    def parse(networkx: Any) -> Any:
+        kind = networkx.DiGraph if directed else networkx.Graph
+        return networkx.parse_edgelist(lines, create_using=kind)
+
+    return _by_networkx(path, "list of links", parse)
+
+
+def _by_networkx(path: str | os.PathLike, what: str, read: Callable[[Any], Any]) -> Any:
     networkx = importlib.import_module("networkx")
-    if not os.path.exists(path):
-        raise FileError(f"{path}: no such file")
     try:
-        return networkx.read_graphml(path)
+        return read(networkx)
     except Exception as error:  # of damaged files networkx and the XML parser raise what they come upon
         reason = str(error).partition("\n")[0] or type(error).__name__
-        raise FileError(f"{path}: not a readable GraphML file ({reason})") from None
+        raise FileError(f"{path}: not a readable {what} ({reason})") from None
 
 
 def _columns(path: str | os.PathLike) -> tuple[list, list, np.ndarray | None]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -213,16 +213,19 @@ def _reward(base: str, entries: Entries, num_states: int, is_chain: bool, remark
     if (path := _part(name, ".trew")) is not None:
         width = 4 - is_chain
         table = _rewards(path, width, num_states, "`state next reward`" if is_chain else "`state choice next reward`")
-        key = [table.whole_numbers(place, "number") for place in range(width - 1)]
-        known = (entries.state, entries.next_state) if is_chain else (entries.state, entries.action, entries.next_state)
-        places = {place: n for n, place in enumerate(zip(*(column.tolist() for column in known), strict=True))}
-        for row, (place, value) in enumerate(
-            zip(zip(*(column.tolist() for column in key), strict=True), table.numbers(width - 1, "reward"), strict=True)
-        ):
-            if place not in places:
-                raise table.error(row, f"there is no transition {' '.join(map(str, place))}")
-            reward[places[place]] += value
+        rewarded = [table.whole_numbers(place, "number") for place in range(width - 1)]
+        there = (entries.state, entries.next_state) if is_chain else (entries.state, entries.action, entries.next_state)
+        place_of = {transition: n for n, transition in enumerate(_rows(there))}
+        values = table.numbers(width - 1, "reward")
+        for row, transition in enumerate(_rows(rewarded)):
+            if transition not in place_of:
+                raise table.error(row, f"there is no transition {' '.join(map(str, transition))}")
+            reward[place_of[transition]] += values[row]
     return reward
+
+
+def _rows(columns: Sequence[np.ndarray]) -> Iterator[tuple[int, ...]]:
+    return zip(*(column.tolist() for column in columns), strict=True)
 
 
 def _rewards(path: str, width: int, num_states: int, expected: str) -> TextTable:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_models import dense_transition
 
-from jaxhom.interop import FileError
+from jaxhom.interop import FileError, cassandra_statements
 from jaxhom.interop.cassandra import from_cassandra
 
 HEAD = "discount: 0.9\nvalues: reward\nstates: a b c\nactions: go stay\nobservations: x y\n"
@@ -162,6 +162,17 @@ def test_where_episodes_start(tmp_path, start, expected):
     assert model.reward is None
 
 
+def test_large_tables_may_be_set_to_0_first(tmp_path):
+    """6 x 10^6 entries that are never written out; what stood there before is gone."""
+    count = 1000
+    text = f"discount: 0.9\nstates: {count}\nactions: 6\nT: * : 3 : 4 0.5\nT: * : * : * 0\n"
+    model = read(tmp_path, text + "T: * : * : 7 1\nT: 2 identity\n")
+    assert model.mdp.next_state.shape == (count, 6, 1)
+    expected = np.full((count, 6), 7)
+    expected[:, 2] = np.arange(count)
+    np.testing.assert_array_equal(model.mdp.next_state[..., 0], expected)
+
+
 def test_models_without_observations(tmp_path):
     """A `.MDP` file: rewards have no fourth field, and may be rows and matrices over next states."""
     text = "discount: 0.9\nstates: 2\nactions: 2\nT: * uniform\nR: 0 : 0 : 1 4\nR: 1 : 0\n1 3\nR: 1 : 1 : * : * 7\n"
@@ -192,16 +203,17 @@ def test_observations_count_where_rewards_depend_on_them(tmp_path):
     assert model.remarks == ("reward depends on the 2 observations: the expected one is used",)
 
 
-def test_compressed_files_and_many_statements(tmp_path):
+def test_compressed_files_and_many_statements(tmp_path, monkeypatch):
     """More statements than are split at once, and one among them that is no plain one."""
-    count = 400
-    rows = [f"T: {a} : {s} : {(s + a) % count} 1.0" for a in range(300) for s in range(count)]
-    rows.insert(100_500, "R: 3\n:\n5 : * : * 2")
-    text = f"discount: 0.9\nstates: {count}\nactions: 300\nobservations: 1\n" + "\n".join(rows)
+    monkeypatch.setattr(cassandra_statements, "_CHUNK", 7)
+    count = 12
+    rows = [f"T: {a} : {s} : {(s + a) % count} 1.0" for a in range(9) for s in range(count)]
+    rows.insert(30, "R: 3\n:\n5 : * : * 2")
+    text = f"discount: 0.9\nstates: {count}\nactions: 9\nobservations: 1\n" + "\n".join(rows)
     path = tmp_path / "ring.POMDP.gz"
     path.write_bytes(gzip.compress(text.encode()))
     model = from_cassandra(path)
-    assert model.mdp.next_state[:, 7, 0].tolist() == [(s + 7) % count for s in range(count)]
+    assert model.mdp.transition[:, 7].argmax(axis=-1).tolist() == [(s + 7) % count for s in range(count)]
     assert np.argwhere(np.asarray(model.reward)).tolist() == [[5, 3]]
 
 

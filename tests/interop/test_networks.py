@@ -144,6 +144,16 @@ def test_both_directions_texts_and_several_links(tmp_path):
     assert from_edges(path, discount=0.9, states="nodes").terminal.tolist() == [False, False, True]
 
 
+@pytest.mark.parametrize("directed", [True, False])
+def test_lists_that_networkx_wrote(tmp_path, directed):
+    graph = (networkx.DiGraph if directed else networkx.Graph)([("a", "b", {"weight": 2}), ("b", "c", {"weight": 1})])
+    networkx.write_edgelist(graph, tmp_path / "roads.edgelist")
+    model = from_edges(tmp_path / "roads.edgelist", discount=0.9, directed=directed)
+    expected = from_networkx(graph, discount=0.9)
+    assert model.state_names == expected.state_names
+    np.testing.assert_array_equal(model.mdp.features, expected.mdp.features)
+
+
 def test_graphml_says_the_same(tmp_path):
     graph, _ = as_networkx(road_graph.road_graph(4, 1))
     networkx.write_graphml(graph, tmp_path / "road.graphml")
@@ -164,6 +174,7 @@ def test_graphml_says_the_same(tmp_path):
         ("a.edgelist", "1 2 3\n3 1 far\n", "line 2: length must be a number, got 'far'"),
         ("a.csv", "u,v,length\n1,2,3\n1,,3\n", "line 3: a link must begin and end somewhere"),
         ("a.csv", "u,v,length\n1,2,3\n1,3\n", "line 3: expected 3 fields"),
+        ("a.edgelist", "1 2 {}\n3 1 {\n", "not a readable list of links ("),
         ("a.graphml", "<graphml", "not a readable GraphML file ("),
         ("a.graphml", "1 2\n", "not a readable GraphML file ("),
     ],

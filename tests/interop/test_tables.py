@@ -8,7 +8,7 @@ import pandas
 import pytest
 from small_models import dense_transition
 
-from jaxhom.interop import FileError, from_table
+from jaxhom.interop import FileError, from_table, text_tables
 
 ROWS = [  # state, action, next state, probability, reward
     ("hall", "left", "hall", 0.25, 1.0),
@@ -57,7 +57,8 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_all_forms_give_the_same_model(tmp_path, form):
+def test_all_forms_give_the_same_model(tmp_path, form, monkeypatch):
+    monkeypatch.setattr(text_tables, "_CHUNK", 2)
     model = from_table(FORMS[form](tmp_path), discount=0.9)
     np.testing.assert_allclose(dense_transition(model.mdp), TRANSITION)
     np.testing.assert_allclose(model.reward, REWARD)

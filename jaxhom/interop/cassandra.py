@@ -11,7 +11,7 @@ rewards with the sign changed. `cassandra_statements` describes the format.
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -98,13 +98,14 @@ def _declared(statements: Statements, word: str) -> Things:
     return things
 
 
-def _discount(statements: Statements, discount, remarks: list[str]) -> Float[ArrayLike, ""]:
+def _discount(statements: Statements, discount: Any, remarks: list[str]) -> float:
     """The discount to use: the given one, or that of the file."""
     found = number_of(statements, "discount")
     if discount is not None:
-        if found is not None and found[1] != discount:
-            remarks.append(f"discount {found[1]:g} replaced by {discount:g}")
-        return discount
+        given = float(checks.require_discount(discount))
+        if found is not None and found[1] != given:
+            remarks.append(f"discount {found[1]:g} replaced by {given:g}")
+        return given
     if found is None:
         raise FileError(f"{statements.path}: it has no discount: give one")
     number, value = found

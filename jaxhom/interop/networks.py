@@ -67,6 +67,8 @@ def from_networkx(
       >>> model.mdp.transition[0].argmax(axis=-1).tolist()  # on towards c, not back
       [2]
     """
+    if not hasattr(graph, "is_multigraph"):
+        raise ValueError(f"graph must be a graph of networkx, got {type(graph).__name__}")
     is_multigraph = graph.is_multigraph()
     directed = graph if graph.is_directed() else graph.to_directed()
     nodes, data = [*directed.nodes], [attributes for _, attributes in directed.nodes(data=True)]
@@ -228,7 +230,10 @@ def _places(nodes: Sequence[Hashable], data: Sequence[dict]) -> np.ndarray | Non
     if data and all("x" in attributes and "y" in attributes for attributes in data):
         pairs = [(attributes["x"], attributes["y"]) for attributes in data]
     elif data and all("pos" in attributes for attributes in data):
-        pairs = [tuple(attributes["pos"])[:2] for attributes in data]
+        pairs = [attributes["pos"] for attributes in data]
+        for node, pair in zip(nodes, pairs, strict=True):
+            if np.shape(pair) != (2,):
+                raise ValueError(f"position of node {node!r} must be two numbers, got {checks.in_one_line(pair)}")
     else:
         return None
     return np.array(

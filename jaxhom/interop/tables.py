@@ -33,6 +33,7 @@ COLUMNS = {
     "reward": ("reward",),
 }
 _OPTIONAL = ("probability", "reward")
+_TOO_LARGE = 2.0**53  # for whole numbers among floats
 
 
 def from_table(
@@ -65,6 +66,8 @@ def from_table(
       >>> from_table([[1, -1], [0, 1]], discount=0.9).mdp.transition[1].tolist()
       [[1.0, 0.0], [0.0, 1.0]]
     """
+    if columns is not None and not isinstance(columns, Mapping):
+        raise ValueError(f"columns must be a mapping, got {checks.in_one_line(columns)}")
     if isinstance(table, str | os.PathLike):
         with errors_of(table):
             return _of_file(table, discount, dict(columns or {}))
@@ -110,23 +113,29 @@ def _of_frame(frame: Any, discount, columns: dict[str, Hashable]) -> ImportedMod
     arrays = {name: checks.as_host_array(f"column {name!r}", frame[header[place]]) for name, place in places.items()}
     shape = arrays["state"].shape
     for name, array in arrays.items():
-        checks.require_shape(f"column {name!r}", array, f"({len(arrays['state'])},)", array.shape == shape[:1])
+        expected = f"({shape[0]},)" if shape else "[N]"
+        checks.require_shape(f"column {name!r}", array, expected, array.ndim == 1 and array.shape == shape[:1])
 
     def values(name: str) -> np.ndarray | list[Hashable]:
         array = arrays[name]
         if array.dtype.kind in "iuf":
-            checks.require_all(
-                f"column {name!r}", array, np.isfinite(array) & (array == np.floor(array)), "must be whole"
-            )
+            is_whole = np.isfinite(array) & (array == np.floor(array)) & (np.abs(array) < _TOO_LARGE)
+            checks.require_all(f"column {name!r}", array, is_whole, "must be a whole number")
             return array.astype(np.int64)
-        missing = np.array([value is None or value != value for value in array.tolist()], bool)
-        checks.require_all(f"column {name!r}", array, ~missing, "is missing")
+        is_there = np.array([not _is_missing(value) for value in array.tolist()], bool)
+        checks.require_all(f"column {name!r}", array, is_there, "is missing")
         return array.tolist()
 
     def numbers(name: str) -> np.ndarray:
         return checks.require_floats(f"column {name!r}", arrays[name]).astype(np.float64)
 
     return _of_columns(places, values, numbers, _ignored(header, places), discount)
+
+
+def _is_missing(value: Any) -> bool:
+    """Whether a cell is empty: None, NaN, or what pandas has for it."""
+    is_nan = isinstance(value, float) and value != value
+    return value is None or is_nan or type(value).__name__ in ("NAType", "NaTType")
 
 
 def _places(header: list, columns: dict[str, Hashable]) -> dict[str, int]:

@@ -188,6 +188,9 @@ def test_discounts(tmp_path):
     assert not any("discount" in remark for remark in read(tmp_path, without, discount=0.5).remarks)
     with pytest.raises(FileError, match="it has no discount: give one"):
         read(tmp_path, without)
+    for wrong in (1.0, "high", [0.5]):
+        with pytest.raises(ValueError, match="discount must"):
+            read(tmp_path, text, discount=wrong)
 
 
 def test_sums_that_are_a_little_off(tmp_path):

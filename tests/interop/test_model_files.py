@@ -53,6 +53,27 @@ def test_other_suffixes_are_refused(tmp_path, name):
         read_model(tmp_path / name)
 
 
+PIECES = ["", "0", "-1", "nan", "1e999", "x", "*", ":", "\n", "#", ",", '"', "@", "{", "é", "9" * 25, "T:", "uniform"]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path, name):
+    """Pieces of each file exchanged for others."""
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(30):
+        text = FILES[name]
+        for start in rng.integers(len(text), size=2):
+            text = text[:start] + PIECES[rng.integers(len(PIECES))] + text[start + rng.integers(5) :]
+        (tmp_path / name).write_text(text)
+        try:
+            read_model(tmp_path / name)
+        except FileError as error:
+            assert "\n" not in str(error) and name in str(error)
+            refused += 1
+    assert refused > 0
+
+
 def test_policies_are_learned_in_files_of_others(tmp_path, capsys):
     """A reward, so that the expert can be sampled; remarks on stderr."""
     for name in ("lamp.POMDP", "walk.csv"):

@@ -110,6 +110,15 @@ def test_bad_graphs_are_refused(change, options, message):
         from_networkx(graph, discount=0.9, **options)
 
 
+def test_what_is_no_graph_is_refused():
+    with pytest.raises(ValueError, match="graph must be a graph of networkx, got dict"):
+        from_networkx({0: [1]}, discount=0.9)
+    graph = networkx.DiGraph([(0, 1)])
+    networkx.set_node_attributes(graph, 3, "pos")
+    with pytest.raises(ValueError, match="position of node 0 must be two numbers, got 3"):
+        from_networkx(graph, discount=0.9)
+
+
 LINKS = [(1, 2, 5.0), (2, 3, 1.5), (3, 1, 2.0), (2, 1, 5.0)]
 FILES = {
     "words": "# roads\n1 2 5\n2 3 1.5\n\n3 1 2\n2 1 5\n",

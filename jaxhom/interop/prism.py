@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 _STATE = re.compile(r"(\d+)\s*:\s*\((.*)\)")
 _LABEL = re.compile(r'(\d+)\s*=\s*"([^"]*)"')
+_UNKNOWN = 2**31 - 1  # number of states, where it is not told
 _WORDS = {"true": True, "false": False}
 
 
@@ -91,9 +92,6 @@ def from_prism(path: str | os.PathLike, *, discount: Float[ArrayLike, ""]) -> Im
             labels=labels,
             remarks=remarks,
         )
-
-
-_UNKNOWN = 2**31 - 1
 
 
 def _part(base: str, suffix: str) -> str | None:

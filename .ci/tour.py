@@ -4,6 +4,7 @@ import os
 import tempfile
 
 import jax
+import networkx
 import numpy as np
 
 import jaxhom
@@ -43,4 +44,7 @@ assert np.isfinite(np.asarray(gradient)).all()
 with tempfile.TemporaryDirectory() as folder:
     interop.save_mdp(os.path.join(folder, "model.npz"), lake.mdp)
     assert interop.load_mdp(os.path.join(folder, "model.npz")).num_states == 16
+    roads = networkx.path_graph(3).to_directed()
+    networkx.write_graphml(roads, os.path.join(folder, "roads.graphml"))
+    assert interop.read_model(os.path.join(folder, "roads.graphml")).mdp.num_states == 4
     plotting.plot_policy(world, learned.policy).figure.savefig(os.path.join(folder, "policy.png"))

@@ -16,6 +16,12 @@ models:
   --mdp MAP.track             a racetrack, one letter per cell: X, #, o or @ wall, space, . or P road, S start, F or G
                               finish
   --mdp MODEL.npz             arrays of your own; see `python -m jaxhom learn --help` for their names
+  --mdp MODEL.POMDP, .MDP     Cassandra's format, as if the state were seen
+  --mdp MODEL.tra             PRISM's explicit files of that name, .sta, .lab, .srew and .trew among them
+  --mdp MODEL.csv, .tsv       columns state, action, next_state, probability, reward
+  --mdp MAP.map, .gw          a grid map of the moving-AI benchmarks; a gridworld
+  --mdp ROADS.graphml, .edgelist, .edges   a network: links are states, exits actions
+  Texts may be compressed (.gz). What was ignored or mended in a file is told on stderr.
 """
 
 
@@ -57,12 +63,12 @@ def add_model_options(parser: Parser) -> None:
     group = parser.add_argument_group("model (see below)")
     source = group.add_mutually_exclusive_group(required=True)
     source.add_argument("--env", nargs="+", metavar=("ID", "NAME=VALUE"), help="a Gymnasium environment")
-    source.add_argument("--mdp", metavar="FILE", help="a model's .npz file, a racetrack's map, or a, b")
+    source.add_argument("--mdp", metavar="FILE", help="a model's file, a racetrack's map, or a, b")
     group.add_argument(
         "--discount",
         type=float,
         metavar="G",
-        help="where the source has none (default 0.99 for environments and racetracks)",
+        help="where the source has none (default 0.99 for those that cannot have one); for .POMDP files in any case",
     )
     group.add_argument(
         "--end-state",

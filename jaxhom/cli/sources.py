@@ -16,7 +16,6 @@ from collections.abc import Hashable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
@@ -29,16 +28,16 @@ from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environment_maps import tile_map
 from jaxhom.interop.environment_tables import require_steps_of_table
 from jaxhom.interop.environments import from_gymnasium
-from jaxhom.interop.files import FileError, load_arrays, load_demonstrations, load_mdp, load_policy
+from jaxhom.interop.files import FileError, load_demonstrations, load_policy
+from jaxhom.interop.model_files import DISCOUNT, read_model
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
-from jaxhom.models.inputs import check_coordinates, check_policy
+from jaxhom.models.inputs import check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
 from jaxhom.models.names import look_up
 from jaxhom.planning.optimal import Plan, optimal_policy
 from jaxhom.similarity.table import SimilarityTable
 
-_DISCOUNT = 0.99  # as the domains of the library
 _TRACK_STEPS = 20  # of a demonstration on a racetrack, and of a trial below, as in the paper
 _TRACK_TRIAL = 30
 _STEPS = 100  # of either, where the source has no limit
@@ -171,14 +170,11 @@ def load_problem(options: argparse.Namespace) -> Problem:
     if options.end_state:
         raise ValueError("--end-state belongs to --env")
     path = options.mdp
-    kind = os.path.splitext(path)[1].lower()
     if path not in SHIPPED and not os.path.exists(path):
         raise FileError(f"{path}: no such file")
-    if path in SHIPPED or kind in (".track", ".txt"):
+    if path in SHIPPED or path.lower().endswith((".track", ".txt")):
         return racetrack_problem(path, options.discount)
-    if kind == ".npz":
-        return _archive(path, options.discount)
-    raise FileError(f"{path}: models are .npz archives or .track maps; {' and '.join(SHIPPED)} come with the library")
+    return _file(path, options.discount)
 
 
 def _environment(options: argparse.Namespace) -> Problem:
@@ -186,7 +182,7 @@ def _environment(options: argparse.Namespace) -> Problem:
     arguments = environment_options(words)
     env = make_environment(name, **arguments)
     try:
-        discount = _DISCOUNT if options.discount is None else options.discount
+        discount = DISCOUNT if options.discount is None else options.discount
         model = from_gymnasium(env, discount=discount, end_state=options.end_state)
         require_steps_of_table(env)
         domain, limit = tile_map(env, model.mdp), (env.spec and env.spec.max_episode_steps) or _STEPS
@@ -214,7 +210,7 @@ def racetrack_problem(path: str, discount: float | None = None) -> Problem:
       OSError: if there is no such file.
     """
     try:
-        track = racetrack(path, discount=_DISCOUNT if discount is None else discount)
+        track = racetrack(path, discount=DISCOUNT if discount is None else discount)
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
     return Problem(
@@ -230,34 +226,18 @@ def racetrack_problem(path: str, discount: float | None = None) -> Problem:
     )
 
 
-def _archive(path: str, discount: float | None) -> Problem:
-    mdp = load_mdp(path, discount=discount)
-    arrays = load_arrays(path, "reward", "coordinates", "terminal")
-    try:
-        known: dict[str, Any] = {name: _CHECKS[name](mdp, array) for name, array in arrays.items()}
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from None
-    return Problem(name=path, mdp=mdp, **known)
-
-
-def _reward(mdp: MDP, reward: np.ndarray) -> jax.Array:
-    states, actions = mdp.num_states, mdp.num_actions
-    good = reward.shape in ((states,), (states, actions))
-    checks.require_shape("reward", reward, f"({states}, {actions}) or ({states},)", good)
-    reward = checks.require_floats_in(mdp.dtype, "reward", reward)
-    return jnp.broadcast_to(checks.to_device(reward.reshape(states, -1)), (states, actions))
-
-
-def _terminal(mdp: MDP, terminal: np.ndarray) -> np.ndarray:
-    checks.require_shape("terminal", terminal, f"({mdp.num_states},)", terminal.shape == (mdp.num_states,))
-    if terminal.dtype != bool:
-        raise ValueError(f"terminal must be bool, got dtype {terminal.dtype}")
-    starts = np.asarray(mdp.initial) > 0
-    checks.require_all("terminal", terminal, ~(terminal & starts), "must be False where episodes start")
-    return terminal
-
-
-_CHECKS = {"reward": _reward, "coordinates": check_coordinates, "terminal": _terminal}
+def _file(path: str, discount: float | None) -> Problem:
+    model = read_model(path, discount=discount)
+    for remark in model.remarks:
+        print(f"jaxhom: {path}: {remark}", file=sys.stderr)
+    return Problem(
+        name=path,
+        mdp=model.mdp,
+        reward=model.reward,
+        terminal=model.terminal,
+        coordinates=model.coordinates,
+        domain=model.domain,
+    )
 
 
 def load_trajectories(problem: Problem, options: argparse.Namespace) -> tuple[Demonstrations, str]:

@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from jaxtyping import Int
 
 
+_VOID = "@"
+
+
 class TileMap(Record):
-    """A model on a map: the cell (r, c) of R x C cells is state r C + c. Build it with `TileMap.from_rows`.
+    """A model on a map: its states are the cells, row by row, but for those that are none. See `TileMap.from_rows`.
 
     Attributes:
-      mdp: the model, S = R C states.
+      mdp: the model, S states.
       rows: the map, R strings of C letters: `#` (no state to act in: a wall, a hole), `.` (open), `S` (start), `F`
-        (goal).
+        (goal), `@` (no state at all).
       moves: per action the (row, column) direction in which it is meant to lead; (0, 0) for staying.
     """
 
@@ -39,7 +42,7 @@ class TileMap(Record):
         """Lays a model out.
 
         Raises:
-          ValueError: if the map is not a rectangle of as many cells as the model has states, a letter is unknown, or
+          ValueError: if the map is no rectangle or has not one cell, `@` left out, per state, a letter is unknown, or
             there is not one move per action.
 
         Example:
@@ -49,11 +52,11 @@ class TileMap(Record):
         """
         rows = tuple(rows)
         is_rectangle = len({len(row) for row in rows}) == 1
-        if not is_rectangle or sum(map(len, rows)) != mdp.num_states:
+        if not is_rectangle or sum(len(row) - row.count(_VOID) for row in rows) != mdp.num_states:
             raise ValueError(f"rows must be equally long and have {mdp.num_states} cells, one per state")
         for number, row in enumerate(rows):
-            if not set(row) <= set("#.SF"):
-                raise ValueError(f"rows[{number}] must be made of #, ., S and F, got {row!r}")
+            if not set(row) <= set("#.SF" + _VOID):
+                raise ValueError(f"rows[{number}] must be made of #, ., S, F and {_VOID}, got {row!r}")
         directions = checks.as_host_array("moves", moves)
         expected = f"({mdp.num_actions}, 2)"
         checks.require_shape("moves", directions, expected, directions.shape == (mdp.num_actions, 2))
@@ -62,16 +65,24 @@ class TileMap(Record):
     @property
     def coordinates(self) -> Int[np.ndarray, "S 2"]:
         """(row, column) of every state."""
-        return np.stack(np.divmod(np.arange(self.mdp.num_states), len(self.rows[0])), axis=-1)
+        return np.argwhere(np.array([list(row) for row in self.rows]) != _VOID)
+
+    @property
+    def letters(self) -> str:
+        """Those of the states' cells, one after the other."""
+        return "".join(self.rows).replace(_VOID, "")
 
     def state_of(self, cell: Sequence[int]) -> int:
         """Returns the state of a cell (row, column).
 
         Raises:
-          ValueError: if the cell is not on the map.
+          ValueError: if the cell is not on the map, or is no state.
         """
         row, column = cell
         height, width = len(self.rows), len(self.rows[0])
         if not (0 <= row < height and 0 <= column < width):
             raise ValueError(f"cell {tuple(cell)} is outside the {height} x {width} map")
-        return int(row) * width + int(column)
+        if self.rows[row][column] == _VOID:
+            raise ValueError(f"cell {tuple(cell)} is no state of the model")
+        before = "".join(self.rows[:row]) + self.rows[row][:column]
+        return len(before) - before.count(_VOID)

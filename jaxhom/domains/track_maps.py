@@ -1,6 +1,6 @@
 """Maps of racetracks as text: one letter per cell, with or without the planning community's header.
 
-    X x # o O   wall, obstacle       S s         road on the start line
+    X x # o O   wall, obstacle       S s         road on the start line          (o: see below)
     @           out of bounds        F G g       finish line
     space . P p road, pothole
 
@@ -9,7 +9,7 @@ must have that size:
 
     dim: 12 35      rows and columns
     12,35           rows and columns
-    35 12           width and height, on one line or on two
+    35 12           width and height, on one line or on two: in such files o is slippery road, here like all other road
 
 Without a header short rows are filled up with wall. Beyond the map is wall. Blank lines at the end are no rows.
 """
@@ -49,8 +49,8 @@ def read_map(track: str | os.PathLike | Iterable[str]) -> tuple[str, ...]:
     lines = _lines(track)
     while lines and not lines[-1]:
         lines.pop()
-    size, first = _header(lines)
-    rows = [_row(text, line) for line, text in enumerate(lines[first:], start=first + 1)]
+    size, first, letters = _header(lines)
+    rows = [_row(text, line, letters) for line, text in enumerate(lines[first:], start=first + 1)]
     if size is None:
         width = max(map(len, rows), default=0)
         rows = [row.ljust(width, "#") for row in rows]
@@ -91,30 +91,30 @@ def _file_text(track: str | os.PathLike) -> str:
         raise ValueError(f"track {str(track)!r} is not a text file: {error.reason} at byte {error.start}") from None
 
 
-def _header(lines: Sequence[str]) -> tuple[tuple[int, int] | None, int]:
-    """(rows, columns) as a header has them, None without one, and the number of its lines."""
+def _header(lines: Sequence[str]) -> tuple[tuple[int, int] | None, int, dict[str, str]]:
+    """(rows, columns) as a header has them, None without one, the number of its lines, and what the letters mean."""
     if not lines or not _HEADER.match(lines[0]):
-        return None, 0
+        return None, 0, _LETTERS
     if match := _ROWS_FIRST.fullmatch(lines[0]):
         rows, columns = (int(number) for number in match.groups() if number)
-        return (rows, columns), 1
+        return (rows, columns), 1, _LETTERS
     for used in (1, 2):
         if match := _WIDTH_FIRST.fullmatch(" ".join(lines[:used])):
-            return (int(match[2]), int(match[1])), used
+            return (int(match[2]), int(match[1])), used, {**_LETTERS, "o": ".", "O": "."}
     raise ValueError(
         "track line 1: a header must be `dim: rows columns`, `rows,columns`, or width and height on one line or on two"
     )
 
 
-def _row(text: str, line: int) -> str:
+def _row(text: str, line: int, letters: dict[str, str]) -> str:
     """One line of a map in the letters `#.SF`."""
     for column, letter in enumerate(text, start=1):
-        if letter not in _LETTERS:
+        if letter not in letters:
             raise ValueError(
                 f"track line {line}, column {column}: unknown letter {letter!r}; "
                 "use X, x, #, o or @ (wall), space, . or p (road), S or s (start), F, G or g (finish)"
             )
-    return "".join(_LETTERS[letter] for letter in text)
+    return "".join(letters[letter] for letter in text)
 
 
 def _require_size(rows: Sequence[str], height: int, width: int, header_lines: int) -> None:

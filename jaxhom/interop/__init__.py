@@ -2,6 +2,8 @@
 
 * `from_gymnasium`, `make_environment`: an environment with a transition table, with its reward.
 * `from_mdptoolbox`, `from_scipy`: transition matrices.
+* `from_cassandra`, `from_prism`, `from_table`, `from_octile`, `from_gridworld`, `from_networkx`, `from_edges`: models
+  that others wrote, as an `ImportedModel` with reward, names and remarks; `read_model` chooses by a file's suffix.
 * `from_samples`: recorded transitions, with the uncertainty of each row.
 * `demonstrations_from_episodes`, `demonstrations_from_steps`, `demonstrations_from_csv`: trajectories of `imitation`,
   Minari, arrays and CSV files, with a report of what was dropped; `answers_from_csv`: answers about single states.
@@ -11,6 +13,7 @@ Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` it
 before it is needed.
 """
 
+from jaxhom.interop.cassandra import from_cassandra
 from jaxhom.interop.csv_steps import answers_from_csv, demonstrations_from_csv
 from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
@@ -24,9 +27,16 @@ from jaxhom.interop.files import (
     save_mdp,
     save_policy,
 )
+from jaxhom.interop.gridworld_files import from_gridworld
 from jaxhom.interop.import_reports import ImportReport
+from jaxhom.interop.imported_model import ImportedModel
 from jaxhom.interop.matrices import from_mdptoolbox, from_scipy
+from jaxhom.interop.model_files import read_model
+from jaxhom.interop.networks import from_edges, from_networkx
+from jaxhom.interop.octile import from_octile
+from jaxhom.interop.prism import from_prism
 from jaxhom.interop.samples import SampledModel, from_samples
+from jaxhom.interop.tables import from_table
 from jaxhom.interop.trajectories import (
     demonstrations_from_episodes,
     demonstrations_from_steps,
@@ -37,21 +47,30 @@ __all__ = [
     "FileError",
     "GymnasiumModel",
     "ImportReport",
+    "ImportedModel",
     "SampledModel",
     "answers_from_csv",
     "demonstrations_from_csv",
     "demonstrations_from_episodes",
     "demonstrations_from_steps",
     "demonstrations_from_transitions",
+    "from_cassandra",
+    "from_edges",
+    "from_gridworld",
     "from_gymnasium",
     "from_mdptoolbox",
+    "from_networkx",
+    "from_octile",
+    "from_prism",
     "from_samples",
     "from_scipy",
+    "from_table",
     "load_arrays",
     "load_demonstrations",
     "load_mdp",
     "load_policy",
     "make_environment",
+    "read_model",
     "save_demonstrations",
     "save_mdp",
     "save_policy",

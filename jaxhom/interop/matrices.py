@@ -1,8 +1,7 @@
 """Models from matrices: the layout of the MDP toolboxes, and SciPy's sparse matrices.
 
 MDP toolboxes (Python, R, MATLAB) keep transitions action first, one S x S matrix per action. Sparse matrices are never
-made dense: their rows become lists of successors, padded to the longest. A model whose rows are all short is small; one
-row with successors everywhere makes all of them long.
+made dense (see `successor_rows`).
 
 Rewards of a toolbox: [S] and [S, A] are what `optimal_policy` and `policy_value` take; [A, S, S], a reward per
 transition, becomes [S, A] by `numpy.einsum("asz,asz->sa", transitions, reward)`.
@@ -10,13 +9,14 @@ transition, becomes [S, A] by `numpy.einsum("asz,asz->sa", transitions, reward)`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 import scipy
 
 from jaxhom import checks
+from jaxhom.interop.successor_rows import checked_rows, model_of_rows
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
@@ -98,9 +98,10 @@ def _from_sparse(matrices: list, discount, initial, features, allowed) -> MDP:
     stacked = scipy.sparse.vstack([scipy.sparse.csr_array(matrix) for matrix in matrices], format="csr")
     allowed = None if allowed is None else _flags(allowed, num_states, num_actions)
     exists = np.ones(len(matrices) * num_states, bool) if allowed is None else allowed.T.ravel()
-    rows = _checked_rows(stacked, exists, lambda row: f"transitions[{row // num_states}] row {row % num_states}")
+    rows = checked_rows(stacked, exists, lambda row: f"transitions[{row // num_states}] row {row % num_states}")
     order = np.arange(num_actions * num_states).reshape(num_actions, num_states).T.ravel()
-    return _from_rows(rows[order], num_actions, discount, initial, features, allowed)
+    options = {"initial": initial, "features": features, "allowed": allowed}
+    return model_of_rows(rows[order], num_actions, discount=discount, **options)
 
 
 def from_scipy(
@@ -147,49 +148,6 @@ def from_scipy(
 
     allowed = None if allowed is None else _flags(allowed, matrix.shape[1], num_actions)
     exists = np.ones(matrix.shape[0], bool) if allowed is None else allowed.ravel()
-    rows = _checked_rows(scipy.sparse.csr_array(matrix), exists, row_name)
-    return _from_rows(rows, num_actions, discount, initial, features, allowed)
-
-
-def _checked_rows(matrix, exists: np.ndarray, row_name: Callable[[int], str]):
-    """A copy with duplicates added up and no zeros, or a `ValueError` if a row that exists is no distribution."""
-    if matrix.dtype.kind not in "iubf":
-        raise ValueError(f"{row_name(0).split()[0]} must hold real numbers, got dtype {matrix.dtype}")
-    keeps_type = matrix.dtype.kind == "f" and matrix.dtype.itemsize <= 8
-    matrix = matrix.astype(matrix.dtype if keeps_type else np.float64, copy=True)
-    matrix.data[~np.repeat(exists, np.diff(matrix.indptr))] = 0
-    matrix.sum_duplicates()
-    matrix.eliminate_zeros()
-    for bad, message in ((~np.isfinite(matrix.data), "be finite"), (matrix.data < 0, "not be negative")):
-        if np.any(bad):
-            entry = int(np.flatnonzero(bad)[0])
-            row = int(np.searchsorted(matrix.indptr, entry, side="right")) - 1
-            column = matrix.indices[entry]
-            raise ValueError(f"{row_name(row)}, column {column} must {message}, got {matrix.data[entry]}")
-    total = np.asarray(matrix.sum(axis=1, dtype=np.float64))
-    wrong = np.flatnonzero(exists & ~checks.sums_to_one(total, matrix.dtype))
-    if wrong.size:
-        raise ValueError(f"{row_name(int(wrong[0]))} must sum to 1, got {total[wrong[0]]}")
-    return matrix
-
-
-def _from_rows(rows, num_actions: int, discount, initial, features, allowed) -> MDP:
-    """A model from a CSR array with rows s * A + a."""
-    num_states = rows.shape[1]
-    lengths = np.diff(rows.indptr)
-    width = max(1, int(lengths.max()))
-    checks.require_slots(num_states, num_actions, width)
-    pair = np.repeat(np.arange(len(lengths)), lengths)
-    slot = np.arange(rows.nnz) - np.repeat(rows.indptr[:-1], lengths)
-    next_state = np.zeros((len(lengths), width), np.int64)
-    probability = np.zeros((len(lengths), width), rows.dtype)
-    next_state[pair, slot], probability[pair, slot] = rows.indices, rows.data
-    shape = (num_states, num_actions, width)
-    return MDP.from_successors(
-        next_state.reshape(shape),
-        probability.reshape(shape),
-        discount=discount,
-        initial=initial,
-        features=features,
-        allowed=allowed,
-    )
+    rows = checked_rows(scipy.sparse.csr_array(matrix), exists, row_name)
+    options = {"initial": initial, "features": features, "allowed": allowed}
+    return model_of_rows(rows, num_actions, discount=discount, **options)

@@ -101,7 +101,7 @@ def board_of(domain: Gridworld | Racetrack | TileMap, kind: Any = (Gridworld, Ra
         raise ValueError(f"the domain must be {names}, got {type(domain).__name__}")
     if isinstance(domain, TileMap):
         shape = (len(domain.rows), len(domain.rows[0]))
-        is_open = np.array([letter in ".S" for row in domain.rows for letter in row])
+        is_open = np.array([letter in ".S" for letter in domain.letters])
         return Board(domain, shape, domain.coordinates, is_open, 1, np.array(domain.moves))
     directions = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
     if isinstance(domain, Gridworld):
@@ -152,7 +152,7 @@ def ground(board: Board, ax: Axes | None, room: float = 0.0) -> Axes:
 
 def _track_image(rows: tuple[str, ...]) -> np.ndarray:
     """RGB image of a track's cells, `_CHECKER` pixels along the side of each."""
-    tone = {"#": WALL, ".": ROAD, "S": START, "F": ROAD}
+    tone = {"#": WALL, "@": WALL, ".": ROAD, "S": START, "F": ROAD}
     letters = np.array([list(row) for row in rows])
     image = np.array([[colors.to_rgb(tone[letter]) for letter in row] for row in letters])
     image = image.repeat(_CHECKER, axis=0).repeat(_CHECKER, axis=1)

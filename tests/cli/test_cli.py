@@ -257,7 +257,7 @@ FEATURES = MODEL + "--features states "
     ("arguments", "message"),
     [
         ("--mdp nowhere.npz --expert 1 --output out", "nowhere.npz: no such file"),
-        ("--mdp a.foo --expert 1 --output out", "a.foo: models are .npz archives or .track maps; a and b come with"),
+        ("--mdp a.foo --expert 1 --output out", "a.foo: models are .npz, .pomdp, .mdp, .tra, .csv, .tsv, .map"),
         ("--mdp bad.track --expert 1 --output out", "bad.track: track line 2, column 3: unknown letter '?'"),
         ("--mdp model.npz --demonstrations nowhere.csv --output out", "nowhere.csv: No such file or directory"),
         ("--mdp model.npz --demonstrations nowhere.npz --output out", "nowhere.npz: no such file"),

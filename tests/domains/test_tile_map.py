@@ -57,8 +57,9 @@ def test_models_without_a_map(name, end_state):
     [
         (["..", "."], [(0, 1), (0, 0)], "rows must be equally long and have 3 cells"),
         (["...."], [(0, 1), (0, 0)], "rows must be equally long and have 3 cells"),
+        (["..@"], [(0, 1), (0, 0)], "rows must be equally long and have 3 cells"),
         ([], [(0, 1), (0, 0)], "rows must be equally long"),
-        (["..x"], [(0, 1), (0, 0)], r"rows\[0\] must be made of #, ., S and F, got '..x'"),
+        (["..x"], [(0, 1), (0, 0)], r"rows\[0\] must be made of #, ., S, F and @, got '..x'"),
         (["..."], [(0, 1)], r"moves must have shape \(2, 2\)"),
     ],
 )
@@ -70,6 +71,14 @@ def test_malformed_maps_are_rejected(rows, moves, message):
 def test_cells_off_the_map_are_rejected():
     with pytest.raises(ValueError, match=r"cell \(1, 0\) is outside the 1 x 3 map"):
         TileMap.from_rows(corridor(), ["..."], [(0, 1), (0, 0)]).state_of((1, 0))
+
+
+def test_cells_that_are_no_states():
+    tiles = TileMap.from_rows(corridor(), ["@.", "S#"], [(0, 1), (0, 0)])
+    assert tiles.coordinates.tolist() == [[0, 1], [1, 0], [1, 1]] and tiles.letters == ".S#"
+    assert [tiles.state_of(cell) for cell in tiles.coordinates] == [0, 1, 2]
+    with pytest.raises(ValueError, match=r"cell \(0, 0\) is no state of the model"):
+        tiles.state_of((0, 0))
 
 
 def test_pictures_draw_what_is_open():

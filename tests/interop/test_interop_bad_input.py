@@ -298,6 +298,11 @@ DOORS = {
     "demonstrations_from_episodes": lambda x, y: interop.demonstrations_from_episodes(x),
     "demonstrations_from_episodes, one": lambda x, y: interop.demonstrations_from_episodes([(x, y)]),
     "demonstrations_from_steps": lambda x, y: interop.demonstrations_from_steps(x, y, y),
+    "from_table": lambda x, y: interop.from_table(x, discount=0.9, columns=y),
+    "from_table, columns": lambda x, y: interop.from_table({"state": x, "action": y, "next": x}, discount=0.9),
+    "from_table, numbers": lambda x, y: interop.from_table(
+        {"state": [0, 0], "action": [0, 0], "next": [0, 1], "probability": x, "reward": y}, discount=0.9
+    ),
     "read_map": lambda x, y: read_map(x if not isinstance(x, str) else [x]),
 }
 

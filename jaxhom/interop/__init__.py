@@ -11,7 +11,8 @@ Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` it
 before it is needed.
 """
 
-from jaxhom.interop.csv_steps import answers_from_csv, demonstrations_from_csv
+from jaxhom.interop.csv_answers import answers_from_csv
+from jaxhom.interop.csv_steps import demonstrations_from_csv
 from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
 from jaxhom.interop.files import (
@@ -27,6 +28,7 @@ from jaxhom.interop.files import (
 from jaxhom.interop.import_reports import ImportReport
 from jaxhom.interop.matrices import from_mdptoolbox, from_scipy
 from jaxhom.interop.samples import SampledModel, from_samples
+from jaxhom.interop.state_sequences import demonstrations_from_states
 from jaxhom.interop.trajectories import (
     demonstrations_from_episodes,
     demonstrations_from_steps,
@@ -41,6 +43,7 @@ __all__ = [
     "answers_from_csv",
     "demonstrations_from_csv",
     "demonstrations_from_episodes",
+    "demonstrations_from_states",
     "demonstrations_from_steps",
     "demonstrations_from_transitions",
     "from_gymnasium",

@@ -25,15 +25,13 @@ from jaxhom.interop.files import (
     save_mdp,
     save_policy,
 )
+from jaxhom.interop.flat_steps import demonstrations_from_steps, demonstrations_from_transitions
 from jaxhom.interop.import_reports import ImportReport
 from jaxhom.interop.matrices import from_mdptoolbox, from_scipy
 from jaxhom.interop.samples import SampledModel, from_samples
 from jaxhom.interop.state_sequences import demonstrations_from_states
-from jaxhom.interop.trajectories import (
-    demonstrations_from_episodes,
-    demonstrations_from_steps,
-    demonstrations_from_transitions,
-)
+from jaxhom.interop.trajectories import demonstrations_from_episodes
+from jaxhom.interop.trajectory_sources import demonstrations_from
 
 __all__ = [
     "FileError",
@@ -41,6 +39,7 @@ __all__ = [
     "ImportReport",
     "SampledModel",
     "answers_from_csv",
+    "demonstrations_from",
     "demonstrations_from_csv",
     "demonstrations_from_episodes",
     "demonstrations_from_states",

@@ -109,5 +109,3 @@ def plain(name: object) -> str:
 def listed(names: Iterable[str]) -> str:
     """Names for a message."""
     return ", ".join(map(repr, names)) or "nothing"
-
-

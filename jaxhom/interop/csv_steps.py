@@ -101,7 +101,7 @@ def demonstrations_from_csv(
     if "episode" in values:
         names = values["episode"][rows.order[rows.first]].tolist()
     try:
-        if "action" in values:
+        if mdp is None or "action" in values:
             demonstrations, report = _with_actions(rows, values, has_action, names)
         else:
             demonstrations, report = inferred_actions(mdp, rows.states(values, has_action), names, ambiguous)

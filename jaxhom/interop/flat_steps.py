@@ -154,7 +154,7 @@ def demonstrations_of_table(
         by_role |= {role: parsed(by_role[role]) for role in ("state", "next_state") if role in fields}
     has_action = ~_is_missing(by_role["action"]) if "action" in fields else np.ones(length, bool)
     rows = _in_order(by_role, has_action)
-    if "action" in fields:
+    if mdp is None or "action" in fields:
         return _read(rows, by_role, has_action, mdp, to_states)
     sequences = rows.states(by_role, has_action)
     if to_states is not None:
@@ -252,5 +252,7 @@ def _read(
 ) -> tuple[Demonstrations, ImportReport]:
     """The demonstrations of rows with actions."""
     parts = rows.states(columns, has_action), rows.actions(columns, has_action), rows.terminated(columns)
-    episodes = [dict(zip(("state", "action", "terminated"), episode, strict=True)) for episode in zip(*parts, strict=True)]
+    episodes = [
+        dict(zip(("state", "action", "terminated"), episode, strict=True)) for episode in zip(*parts, strict=True)
+    ]
     return read_episodes(episodes, mdp=mdp, to_states=to_states)

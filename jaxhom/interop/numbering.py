@@ -9,17 +9,17 @@ the names is a whole number, and else an index.
 from __future__ import annotations
 
 import ast
-import difflib
 import functools
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from jaxhom import checks
 from jaxhom.interop.import_reports import LARGEST_INDEX
 from jaxhom.models.mdp import MDP
+from jaxhom.models.names import look_up
 
 NO_ACTION = frozenset(("", "nan", "none", "null", "na", "n/a", "<na>"))  # what stands for no index
 _MOST_CHARACTERS = 100_000  # of a cell that is looked at as a Python literal
@@ -36,6 +36,7 @@ class Numbering:
 
     def __init__(self, kind: str, limit: int = LARGEST_INDEX, names: Sequence[Hashable] | None = None):
         self.kind, self.limit, self.names = kind, limit, names
+        self._remedy = "; to_states turns other observations into state indices" if kind == "state" else ""
 
     def index_of_text(self, text: str) -> int:
         """The index that a text means.
@@ -48,8 +49,8 @@ class Numbering:
                 if name in self._by_name:
                     return self._by_name[name]
         number = whole_number(text)
-        if number is None or (self.names is not None and self._has_numbers):
-            raise ValueError(self._refusal(text))
+        if number is None or self._has_numbers:
+            self._refuse(text)
         if not 0 <= number < self.limit:
             raise ValueError(f"must lie in [0, {self.limit}), got {text}")
         return number
@@ -67,15 +68,12 @@ class Numbering:
         array = checks.as_host_array(name, values)
         if array.ndim == 2 and array.shape[1] == 1:
             array = array[:, 0]
-        remedy = ""
-        if self.kind == "state":
-            remedy = "; to_states turns other observations into state indices"
         if array.ndim != 1:
-            raise ValueError(f"{name} must have shape [H] or [H, 1], got {array.shape}{remedy}")
+            raise ValueError(f"{name} must have shape [H] or [H, 1], got {array.shape}{self._remedy}")
         if not array.size:  # an empty list has no type of its own
             return np.zeros(0, np.int64)
         if array.dtype.kind not in "iuf":
-            raise ValueError(f"{name} must be whole numbers, got dtype {array.dtype}{remedy}")
+            raise ValueError(f"{name} must be whole numbers, got dtype {array.dtype}{self._remedy}")
         return checks.require_integers(name, array, self.limit)
 
     def _named(self, name: str, values: Any) -> np.ndarray | None:
@@ -86,10 +84,10 @@ class Numbering:
         found = dict.fromkeys(keys, 0)
         for key in found:
             try:
-                found[key] = self.index_of_text(key) if isinstance(key, str) else self._by_name[key]
-            except (ValueError, KeyError):
-                reason = self._refusal(key)
-                raise ValueError(f"{name}[{keys.index(key)}] {reason}") from None
+                found[key] = self.index_of_text(key) if isinstance(key, str) else look_up(self.kind, self._by_name, key)
+            except ValueError as error:
+                remedy = "" if self.names else self._remedy
+                raise ValueError(f"{name}[{keys.index(key)}]: {error}{remedy}") from None
         return np.fromiter((found[key] for key in keys), np.int64, len(keys))
 
     @functools.cached_property
@@ -100,20 +98,18 @@ class Numbering:
     def _has_numbers(self) -> bool:
         return any(isinstance(name, int | float) for name in self._by_name)
 
-    def _refusal(self, given: Hashable) -> str:
-        if self.names is None:
-            return f"must be a whole number, got {given!r}"
-        known = {str(name): name for name in self.names}
-        close = difflib.get_close_matches(str(given), known, 1) if len(known) <= 100_000 else []
-        hint = f"; the nearest is {known[close[0]]!r}" if close else ""
-        return f"must be a {self.kind} of the model, by its name, got {checks.in_one_line(given)}{hint}"
+    def _refuse(self, given: Hashable) -> NoReturn:
+        """Raises about what is no name, or no whole number if there are no names."""
+        if self.names is not None:
+            look_up(self.kind, self._by_name, given)
+        raise ValueError(f"must be a whole number, got {given!r}")
 
 
 def numberings(mdp: MDP | None) -> tuple[Numbering, Numbering]:
     """Of the states and of the actions of a model; of all whole numbers without one."""
     if mdp is None:
         return Numbering("state"), Numbering("action")
-    names = (getattr(mdp, name, None) for name in ("state_names", "action_names"))
+    names = (mdp.state_names, mdp.action_names)
     sizes = (mdp.num_states, mdp.num_actions)
     states, actions = (Numbering(*each) for each in zip(("state", "action"), sizes, names, strict=True))
     return states, actions

@@ -19,6 +19,7 @@ from jaxhom.interop.numbering import numberings
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
+from jaxhom.models.names import described
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -88,21 +89,25 @@ def inferred_actions(
     impossible = np.flatnonzero(count[kind] == 0)
     if len(impossible):
         i = impossible[0]
-        raise ValueError(f"{where(i)}: no action leads from state {before[i]} to state {after[i]}")
+        raise ValueError(f"{where(i)}: no action leads from {_between(mdp, before[i], after[i])}")
     unclear = np.flatnonzero(count[kind] > 1)
     several = [tuple(np.flatnonzero(row).tolist()) for row in chance > 0]
     if len(unclear) and ambiguous == "refuse":
         i = unclear[0]
-        actions = ", ".join(map(str, several[kind[i]]))
-        raise ValueError(f"{where(i)}: actions {actions} lead from state {before[i]} to state {after[i]}")
+        which = ", ".join(map(str, several[kind[i]]))
+        raise ValueError(f"{where(i)}: actions {which} lead from {_between(mdp, before[i], after[i])}")
     # Ties up to rounding: tables are often computed.
     nearly = chance >= chance.max(axis=1, keepdims=True, initial=0.0) * (1 - 16 * np.finfo(mdp.dtype).eps)
     is_clear = nearly.sum(axis=1) == 1 if ambiguous == "likeliest" else count == 1
     cuts = np.cumsum(lengths)[:-1]
-    actions = np.split(chance.argmax(axis=1)[kind] if len(kind) else kind, cuts)
+    actions = np.split(chance.argmax(axis=1)[kind], cuts)
     demonstrations, report = _hidden(sequences, actions, np.split(is_clear[kind], cuts), names)
     told = tuple((names[sequence[i]], int(step[i]), several[kind[i]]) for i in unclear)
     return demonstrations, dataclasses.replace(report, ambiguous=told)
+
+
+def _between(mdp: MDP, state: int, successor: int) -> str:
+    return f"state {described(state, mdp.state_names)} to state {described(successor, mdp.state_names)}"
 
 
 def _chances(mdp: MDP, states: np.ndarray, successors: np.ndarray) -> Float[np.ndarray, "P A"]:

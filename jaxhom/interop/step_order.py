@@ -124,32 +124,32 @@ def _found(columns: Mapping[str, np.ndarray], has_action: np.ndarray) -> np.ndar
         begins = begins | ~_equal(columns["next_state"][:-1], columns["state"][1:])
     if "step" in columns:
         begins = begins | (columns["step"][1:] <= columns["step"][:-1])
-    return np.append(0, np.cumsum(begins))
+    return np.cumsum(np.append(False, begins))
 
 
 def _require_consistent(columns, has_action, former, later) -> None:
     """Raises at the first of the pairs of rows that follow each other in an episode and do not fit."""
 
-    def refuse(bad: np.ndarray, reason: Callable[[Any, Any], Refusal]) -> None:
-        if bad.any():
-            raise reason(former[bad.argmax()], later[bad.argmax()])
+    def first(bad: np.ndarray) -> tuple[int, int] | None:
+        return (former[bad.argmax()], later[bad.argmax()]) if bad.any() else None
 
     if "step" in columns:
         step = columns["step"]
-        refuse(step[former] == step[later], lambda a, b: Refusal(f"step {step[a]} occurs twice in its episode", a, b))
-    ended = "a step after its episode's final observation (a line without action)"
-    refuse(~has_action[former], lambda _, b: Refusal(ended, b))
+        if pair := first(step[former] == step[later]):
+            raise Refusal(f"step {step[pair[0]]} occurs twice in its episode", *pair)
+    if pair := first(~has_action[former]):
+        raise Refusal("a step after its episode's final observation (a line without action)", pair[1])
     for role in ("terminated", "truncated"):
         if role in columns:
-            bad = columns[role][former] & has_action[later]
-            refuse(bad, lambda _, b, role=role: Refusal(f"a step after the one that {role} its episode", b))
+            if pair := first(columns[role][former] & has_action[later]):
+                raise Refusal(f"a step after the one that {role} its episode", pair[1])
     if "next_state" in columns:
         state, follows = columns["state"], columns["next_state"]
-        bad = ~_equal(follows[former], state[later]) & has_action[former]
-        refuse(bad, lambda a, b: Refusal(f"the next state is {follows[a]}, but then the state is {state[b]}", a, b))
+        if pair := first(~_equal(follows[former], state[later]) & has_action[former]):
+            raise Refusal(f"the next state is {follows[pair[0]]}, but then the state is {state[pair[1]]}", *pair)
 
 
 def _equal(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """bool [T], which rows of two arrays [T, ...] are equal."""
     same = np.asarray(left == right)
-    return same.reshape(len(same), -1).all(axis=1)
+    return np.all(same.reshape(len(same), -1), axis=1)

@@ -38,7 +38,7 @@ def fields_by_role(source: Any, columns: Mapping[str, str] | None = None) -> dic
     Raises:
       ValueError: as `find_columns`.
     """
-    if isinstance(source, Mapping) or (hasattr(source, "columns") and hasattr(source, "__getitem__")):
+    if is_keyed(source):
         names = list(source)
         found = _found(tuple(map(str, names)), tuple(sorted((columns or {}).items())))
         fields = {role: source[names[place]] for role, place in found.items()}
@@ -47,6 +47,18 @@ def fields_by_role(source: Any, columns: Mapping[str, str] | None = None) -> dic
         found = _found(tuple(names), tuple(sorted((columns or {}).items())))
         fields = {role: getattr(source, names[place]) for role, place in found.items()}
     return {role: field for role, field in fields.items() if field is not None}
+
+
+def is_keyed(source: Any) -> bool:
+    """Whether something has columns by name: a mapping or a data frame."""
+    return isinstance(source, Mapping) or (hasattr(source, "columns") and hasattr(source, "__getitem__"))
+
+
+def field(source: Any, name: str) -> Any:
+    """The column of one name, None if there is none."""
+    if is_keyed(source):
+        return source[name] if name in source else None  # noqa: SIM401 (data frames have no `get` of this kind)
+    return getattr(source, name, None)
 
 
 def _is_field(source: Any, name: str) -> bool:

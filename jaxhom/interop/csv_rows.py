@@ -1,4 +1,4 @@
-"""Text tables as people keep them: fields between commas, semicolons, tabs, bars or blanks, columns by many names.
+"""Text tables as people keep them: fields between commas, semicolons, tabs, bars or blanks.
 
 Which of these stands between the fields is told by the first line: it is the one that finds the most column names in
 it.
@@ -7,8 +7,9 @@ it.
 from __future__ import annotations
 
 import csv
+import itertools
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from jaxhom.interop.column_names import KNOWN, plain
@@ -16,6 +17,7 @@ from jaxhom.interop.files import FileError
 from jaxhom.interop.text_files import open_text
 
 _DELIMITERS = (",", ";", "\t", "|")
+_AT_ONCE = 300  # rows before they become parts of columns: what outlives them, the garbage collector looks through
 
 
 class Table(NamedTuple):
@@ -25,15 +27,15 @@ class Table(NamedTuple):
       path: the file.
       delimiter: what stands between its fields; None for blanks.
       header: the names of its columns, as they stand in the first line.
-      rows: the fields of the other lines.
-      lines: their numbers in the file.
+      columns: the fields of the other lines, column by column; None where a line ends before.
+      lines: the numbers of these lines in the file.
     """
 
     path: str | os.PathLike
     delimiter: str | None
     header: list[str]
-    rows: list[list[str]]
-    lines: Sequence[int]
+    columns: list[list[str | None]]
+    lines: list[int]
 
     def column(self, place: int) -> list[str]:
         """The fields of a column, without the blanks around them.
@@ -41,12 +43,13 @@ class Table(NamedTuple):
         Raises:
           FileError: naming the first line that ends before it.
         """
-        try:
-            return [row[place].strip() for row in self.rows]
-        except IndexError:
-            index = next(i for i, row in enumerate(self.rows) if len(row) <= place)
-            message = f"{len(self.rows[index])} fields, but the first line names more columns"
-            raise FileError(f"{self.path} line {self.lines[index]}: {message}") from None
+        cells = self.columns[place]
+        if None in cells:
+            index = cells.index(None)
+            width = sum(column[index] is not None for column in self.columns)
+            message = f"{width} fields, but the first line names more columns"
+            raise FileError(f"{self.path} line {self.lines[index]}: {message}")
+        return [cell.strip() for cell in cells if cell is not None]
 
     def refuse(self, index: int, place: int, reason: object) -> FileError:
         """The error about a field."""
@@ -63,32 +66,46 @@ def read_table(path: str | os.PathLike, columns: Mapping[str, str] | None = None
     Raises:
       FileError: if it is missing, no text, or no table, naming the line.
     """
-    lines: list[int] = []
-    rows: list[list[str]] = []
     with open_text(path, newline="") as file:
         first = file.readline()
         delimiter = _delimiter(first, set(map(plain, (columns or {}).values())))
-        if delimiter is None:
-            for number, line in enumerate([first, *file], 1):
-                if fields := line.split():
-                    rows.append(fields)
-                    lines.append(number)
-        else:
-            reader = csv.reader(_chain(first, file), delimiter=delimiter, strict=True)
-            try:
-                for row in reader:
-                    if row:
-                        rows.append(row)
-                        lines.append(reader.line_num)
-            except csv.Error as error:
-                raise FileError(f"{path} line {reader.line_num}: {error}") from None
-    header = rows[0] if rows else []
-    if header and header[0].startswith("#"):  # as `numpy.savetxt` marks it
-        header[0] = header[0][1:]
-        header = header if header[0].strip() else header[1:]
-    table = Table(path, delimiter, header, rows[1:], lines[1:])
-    _require_fields(table)
+        rows = _rows(path, itertools.chain([first] if first else [], file), delimiter)
+        _, header = next(rows, (1, []))
+        if header and header[0].startswith("#"):  # as `numpy.savetxt` marks it
+            header[0] = header[0][1:]
+            header = header if header[0].strip() else header[1:]
+        table = Table(path, delimiter, header, [[] for _ in header], [])
+        while part := list(itertools.islice(rows, _AT_ONCE)):
+            _append(table, part)
     return table
+
+
+def _rows(path: str | os.PathLike, file: Iterable[str], delimiter: str | None) -> Iterator[tuple[int, list[str]]]:
+    """The number and the fields of every line that is not blank."""
+    if delimiter is None:
+        yield from ((number, fields) for number, line in enumerate(file, 1) if (fields := line.split()))
+        return
+    reader = csv.reader(file, delimiter=delimiter, strict=True)
+    try:
+        for row in reader:
+            if row:
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise FileError(f"{path} line {reader.line_num}: {error}") from None
+
+
+def _append(table: Table, part: list[tuple[int, list[str]]]) -> None:
+    """Adds rows to a table; raises at the first with more fields than columns, unless the rest are empty."""
+    width = len(table.header)
+    for line, row in part:
+        if len(row) > width and any(field.strip() for field in row[width:]):
+            raise FileError(f"{table.path} line {line}: {len(row)} fields, but the first line names {width} columns")
+    lines, rows = zip(*part, strict=True)
+    table.lines.extend(lines)
+    for column, cells in zip(table.columns, itertools.zip_longest(*rows), strict=False):
+        column.extend(cells)
+    for column in table.columns:  # those that all these rows end before
+        column.extend([None] * (len(table.lines) - len(column)))
 
 
 def _delimiter(line: str, given: set[str]) -> str | None:
@@ -103,17 +120,3 @@ def _delimiter(line: str, given: set[str]) -> str | None:
         return len(known.intersection(map(plain, fields)))
 
     return max((*_DELIMITERS, None), key=found)  # the first of the best: a comma if nothing is found
-
-
-def _chain(first: str, rest: Iterable[str]) -> Iterable[str]:
-    if first:
-        yield first
-    yield from rest
-
-
-def _require_fields(table: Table) -> None:
-    """Raises at the first line with more fields than columns, unless the rest are empty."""
-    width = len(table.header)
-    for row, line in zip(table.rows, table.lines, strict=True):
-        if len(row) > width and any(field.strip() for field in row[width:]):
-            raise FileError(f"{table.path} line {line}: {len(row)} fields, but the first line names {width} columns")

@@ -18,10 +18,11 @@ from jaxhom import checks
 from jaxhom.interop.column_names import find_columns, listed, plain
 from jaxhom.interop.csv_rows import Table, read_table
 from jaxhom.interop.files import FileError
-from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport, with_report
-from jaxhom.interop.numbering import NO_ACTION, Numbering, indices_by_cell, numberings, parsed
+from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport
+from jaxhom.interop.numbering import NO_ACTION, Numbering, indices_by_cell, number_in_order, numberings, parsed
 from jaxhom.interop.state_sequences import inferred_actions
-from jaxhom.interop.step_order import Refusal, Rows, put_in_order
+from jaxhom.interop.step_assembly import assembled
+from jaxhom.interop.step_order import Refusal, put_in_order
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
 
@@ -82,14 +83,14 @@ def demonstrations_from_csv(
     table = read_table(path, columns)
     needed = ("state",) if mdp is not None else ("state", "action")  # a model finds the actions between states
     places = places_of(table, needed, columns)
-    if not table.rows:
+    if not table.lines:
         raise FileError(f"{path}: there are no episodes")
     states, actions = numberings(mdp)
-    values = _plain_columns(table, places)
+    values, names = _plain_columns(table, places)
     for role in ("state", "next_state"):
         if role in places:
             values[role] = _states(table, places[role], states, to_states)
-    has_action = np.ones(len(table.rows), bool)
+    has_action = np.ones(len(table.lines), bool)
     if "action" in places:
         values["action"], has_action = _actions(table, places["action"], actions)
     try:
@@ -97,12 +98,11 @@ def demonstrations_from_csv(
     except Refusal as refusal:
         where = refusal.said("line", lambda row: table.lines[row])
         raise FileError(f"{path} {where}" if refusal.rows else f"{path} line 1: {refusal}") from None
-    names: Sequence = range(len(rows.first))
-    if "episode" in values:
-        names = values["episode"][rows.order[rows.first]].tolist()
+    if "episode" not in values:
+        names = range(len(rows.first))
     try:
         if mdp is None or "action" in values:
-            demonstrations, report = _with_actions(rows, values, has_action, names)
+            demonstrations, report = assembled(rows, values, has_action, names)
         else:
             demonstrations, report = inferred_actions(mdp, rows.states(values, has_action), names, ambiguous)
     except ValueError as error:
@@ -156,7 +156,7 @@ def _states(table: Table, place: int, numbering: Numbering, to_states: Callable 
     values = to_states(parsed(table.column(place)))
     try:
         indices = numbering.indices("to_states: states", values)
-        checks.require_shape("to_states: states", indices, f"({len(table.rows)},)", len(indices) == len(table.rows))
+        checks.require_shape("to_states: states", indices, f"({len(table.lines)},)", len(indices) == len(table.lines))
     except ValueError as error:
         raise FileError(f"{table.path}: {error}") from None
     return indices
@@ -168,14 +168,15 @@ def _actions(table: Table, place: int, numbering: Numbering) -> tuple[np.ndarray
     return indices, indices >= 0
 
 
-def _plain_columns(table: Table, places: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """The columns that hold neither states nor actions: names of episodes, numbers of steps, flags."""
+def _plain_columns(table: Table, places: Mapping[str, int]) -> tuple[dict[str, np.ndarray], Sequence[int | str]]:
+    """The columns that hold neither states nor actions, episodes by number; and the names of these."""
     columns: dict[str, np.ndarray] = {}
+    names: Sequence[Any] = ()
     if "episode" in places:
         cells = table.column(places["episode"])
         if "" in cells:
             raise table.refuse(cells.index(""), places["episode"], "is empty")
-        columns["episode"] = np.array(cells)
+        (columns["episode"],), names = number_in_order([cells])
     if "step" in places:
         try:
             columns["step"] = column_of_indices(table, places["step"], Numbering("step", LARGEST_INDEX))
@@ -189,20 +190,4 @@ def _plain_columns(table: Table, places: Mapping[str, int]) -> dict[str, np.ndar
                 row = int(flags.argmin())
                 raise table.refuse(row, places[role], f"must be true or false, got {cells[row]!r}")
             columns[role] = flags == 1
-    return columns
-
-
-def _with_actions(
-    rows: Rows, columns: Mapping[str, np.ndarray], has_action: np.ndarray, names: Sequence
-) -> tuple[Demonstrations, ImportReport]:
-    """The demonstrations of steps with actions."""
-    kept, ended, dropped, final = [], [], [], 0
-    parts = rows.states(columns, has_action), rows.actions(columns, has_action), rows.terminated(columns)
-    for name, states, actions, is_end in zip(names, *parts, strict=True):
-        if not len(actions):
-            dropped.append((name, "it has no actions"))
-            continue
-        kept.append((states, actions))
-        final += len(states) - len(actions)
-        ended.append(is_end)
-    return with_report(kept, dropped, final, ended)
+    return columns, names

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.column_names import fields_by_role, listed
+from jaxhom.interop.column_names import field, fields_by_role, listed
 from jaxhom.interop.import_reports import ImportReport
-from jaxhom.interop.numbering import NO_ACTION, literal, parsed
+from jaxhom.interop.numbering import NO_ACTION, literal, numberings, parsed
 from jaxhom.interop.state_sequences import demonstrations_from_states
+from jaxhom.interop.step_assembly import assembled
 from jaxhom.interop.step_order import Refusal, Rows, put_in_order
-from jaxhom.interop.trajectories import as_flags, read_episodes
+from jaxhom.interop.trajectories import as_flags, is_time_limit, read_episodes
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
 
@@ -135,12 +136,15 @@ def demonstrations_of_table(
     Raises:
       ValueError: naming the column, or the rows, that cannot be used.
     """
-    fields = {role: _column(role, field) for role, field in fields_by_role(table, columns).items()}
+    fields = {role: _column(role, column) for role, column in fields_by_role(table, columns).items()}
     needed = ("state",) if mdp is not None else ("state", "action")  # a model finds the actions between states
     for role in needed:
         if role not in fields:
             raise ValueError(f"column {role!r} is missing (there is {listed(fields)})")
     fields = _filled(table, fields)
+    infos = field(table, "infos")  # imitation's
+    if "truncated" not in fields and infos is not None and len(infos) == len(fields["state"]):
+        fields["truncated"] = np.array([is_time_limit(info) for info in infos])
     if any(fields[role].ndim == 2 for role in _FLAGS if role in fields):
         fields = _one_after_the_other(fields)
     if "action" in fields and len(fields["state"]) == 1 + len(fields["action"]):
@@ -172,8 +176,9 @@ def _holds_episodes(states: np.ndarray, actions: np.ndarray) -> bool:
 def _one_a_row(table: Any, columns: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     """The rows of a table as episodes."""
     cells = {role: list(map(_cell, column)) for role, column in columns.items() if role != "episode"}
-    if isinstance(table, Mapping) and "infos" in table:  # imitation's
-        cells["infos"] = table["infos"]
+    infos = field(table, "infos")
+    if infos is not None:
+        cells["infos"] = infos
     return [dict(zip(cells, row, strict=True)) for row in zip(*cells.values(), strict=True)]
 
 
@@ -205,22 +210,22 @@ def _column(role: str, field: Any) -> np.ndarray:
 
 def _filled(table: Any, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The part of a replay buffer (Stable-Baselines3's) that has been filled, from the oldest step on."""
-    position, is_full = getattr(table, "pos", None), getattr(table, "full", None)
-    if not isinstance(position, int) or not isinstance(is_full, bool):
+    position, is_full, size = (getattr(table, name, None) for name in ("pos", "full", "buffer_size"))
+    if not isinstance(position, int) or not isinstance(is_full, bool) or position == size:
         return fields
     if is_full:
-        return {role: np.roll(field, -position, axis=0) for role, field in fields.items()}
-    return {role: field[:position] for role, field in fields.items()}
+        return {role: np.roll(column, -position, axis=0) for role, column in fields.items()}
+    return {role: column[:position] for role, column in fields.items()}
 
 
 def _one_after_the_other(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Columns of E environments side by side, [T, E, ...], as [E T, ...]: one environment after the other."""
     steps, environments = next(fields[role].shape for role in _FLAGS if role in fields and fields[role].ndim == 2)
     flat = {
-        role: field.swapaxes(0, 1).reshape(-1, *field.shape[2:])
-        if field.shape[:2] == (steps, environments)
-        else field  # buffers that have been trained on are flat already, but for their flags
-        for role, field in fields.items()
+        role: column.swapaxes(0, 1).reshape(-1, *column.shape[2:])
+        if column.shape[:2] == (steps, environments)
+        else column  # buffers that have been trained on are flat already, but for their flags
+        for role, column in fields.items()
     }
     first = np.arange(steps * environments) % steps == 0
     start = as_flags("start", flat["start"], len(first)) if "start" in flat else np.zeros(len(first), bool)
@@ -250,9 +255,18 @@ def _read(
     mdp: MDP | None,
     to_states: Callable[[Any], Any] | None,
 ) -> tuple[Demonstrations, ImportReport]:
-    """The demonstrations of rows with actions."""
+    """The demonstrations of rows with actions: all at once, or episode by episode where some have to be dropped."""
+    of_states, of_actions = numberings(mdp)
+    try:
+        if to_states is None:
+            roles = [role for role in ("state", "next_state") if role in columns]
+            actions = np.zeros(len(has_action), np.int64)
+            actions[has_action] = of_actions.indices("actions", columns["action"][has_action])
+            states = {role: of_states.indices("observations", columns[role]) for role in roles}
+            return assembled(rows, {**columns, **states, "action": actions}, has_action, range(len(rows.first)))
+    except ValueError:
+        pass
     parts = rows.states(columns, has_action), rows.actions(columns, has_action), rows.terminated(columns)
-    episodes = [
-        dict(zip(("state", "action", "terminated"), episode, strict=True)) for episode in zip(*parts, strict=True)
-    ]
+    names = ("state", "action", "terminated")
+    episodes = [dict(zip(names, episode, strict=True)) for episode in zip(*parts, strict=True)]
     return read_episodes(episodes, mdp=mdp, to_states=to_states)

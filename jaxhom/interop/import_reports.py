@@ -67,10 +67,7 @@ def with_report(
     Raises:
       ValueError: if nothing was kept, with the first reason.
     """
-    if not kept:
-        if not dropped:
-            raise ValueError("there are no episodes")
-        raise ValueError(f"none of {len(dropped)} episodes can be used; episode {dropped[0][0]}: {dropped[0][1]}")
+    require_some(len(kept), dropped)
     ended = None if terminated is None else np.array(terminated)
     demonstrations = Demonstrations.from_trajectories(kept, terminated=ended)
     steps = sum(len(actions) for _, actions in kept)
@@ -78,3 +75,11 @@ def with_report(
         episodes=len(kept), steps=steps, final_observations=final_observations, dropped=tuple(dropped)
     )
     return demonstrations, report
+
+
+def require_some(kept: int, dropped: Sequence[tuple[int | str, str]]) -> None:
+    """Raises if no episode is left, with the first reason."""
+    if not kept:
+        if not dropped:
+            raise ValueError("there are no episodes")
+        raise ValueError(f"none of {len(dropped)} episodes can be used; episode {dropped[0][0]}: {dropped[0][1]}")

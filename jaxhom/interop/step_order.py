@@ -140,9 +140,8 @@ def _require_consistent(columns, has_action, former, later) -> None:
     if pair := first(~has_action[former]):
         raise Refusal("a step after its episode's final observation (a line without action)", pair[1])
     for role in ("terminated", "truncated"):
-        if role in columns:
-            if pair := first(columns[role][former] & has_action[later]):
-                raise Refusal(f"a step after the one that {role} its episode", pair[1])
+        if role in columns and (pair := first(columns[role][former] & has_action[later])):
+            raise Refusal(f"a step after the one that {role} its episode", pair[1])
     if "next_state" in columns:
         state, follows = columns["state"], columns["next_state"]
         if pair := first(~_equal(follows[former], state[later]) & has_action[former]):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.column_names import fields_by_role
+from jaxhom.interop.column_names import field, fields_by_role
 from jaxhom.interop.import_reports import ImportReport, with_report
 from jaxhom.interop.numbering import Numbering, numberings
 from jaxhom.models.demonstrations import Demonstrations
@@ -138,16 +138,25 @@ def _has_terminated(position: int, episode, fields: Mapping[str, Any]) -> bool:
     return bool(ended and not cut and not _was_cut_by_time(episode))
 
 
-def _was_cut_by_time(episode) -> bool:
-    """Whether imitation's `infos` say that a time limit ended an episode; as dictionaries, or texts of them in JSON."""
-    infos = episode.get("infos") if isinstance(episode, Mapping) else getattr(episode, "infos", None)
-    last = infos[-1] if isinstance(infos, Sequence | np.ndarray) and np.size(infos) else None
-    if isinstance(last, str):
+def _was_cut_by_time(episode: Any) -> bool:
+    """Whether imitation's `infos` say that a time limit ended an episode."""
+    infos = None if isinstance(episode, tuple | list) else field(episode, "infos")
+    return isinstance(infos, Sequence | np.ndarray) and np.size(infos) > 0 and is_time_limit(infos[-1])
+
+
+def is_time_limit(info: Any) -> bool:
+    """Whether an `info` of imitation's says that a time limit ended the episode: as a dictionary, or its text in JSON.
+
+    `imitation` writes these texts by jsonpickle, of which nothing is unpickled.
+    """
+    if isinstance(info, str):
+        if "TimeLimit" not in info:
+            return False
         try:
-            last = json.loads(last)  # `imitation` writes them by jsonpickle, of which nothing is unpickled
+            info = json.loads(info)
         except ValueError:
             return False
-    return isinstance(last, Mapping) and last.get("TimeLimit.truncated") is True
+    return isinstance(info, Mapping) and info.get("TimeLimit.truncated") is True
 
 
 def _flags_of(position: int, fields: Mapping[str, Any], role: str) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.column_names import KNOWN, fields_by_role, find_columns, listed, plain
+from jaxhom.interop.column_names import KNOWN, fields_by_role, find_columns, is_keyed, listed, plain
 from jaxhom.interop.csv_steps import demonstrations_from_csv
 from jaxhom.interop.files import DEMONSTRATIONS, FileError, load_arrays, load_demonstrations, names_of_arrays
 from jaxhom.interop.flat_steps import demonstrations_of_table
@@ -102,7 +102,7 @@ def _from_object(source: Any, options: dict[str, Any]) -> tuple[Demonstrations, 
         source = {name: list(source[name]) for name in source.column_names}
     has_episodes = isinstance(source, list | tuple) or callable(getattr(source, "iterate_episodes", None))
     if not has_episodes and "state" in fields_by_role(source, options["columns"]):
-        return _from_table(source, list(source) if hasattr(source, "__getitem__") else [], options)
+        return _from_table(source, list(source) if is_keyed(source) else (), options)
     only = {name: options[name] for name in ("mdp", "columns", "to_states")}
     return read_episodes(source, **only)
 

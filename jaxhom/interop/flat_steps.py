@@ -13,7 +13,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.interop.column_names import field, fields_by_role, listed
 from jaxhom.interop.import_reports import ImportReport
-from jaxhom.interop.numbering import NO_ACTION, literal, numberings, parsed
+from jaxhom.interop.numbering import NO_ACTION, Numbering, literal, numberings, parsed
 from jaxhom.interop.state_sequences import demonstrations_from_states
 from jaxhom.interop.step_assembly import assembled
 from jaxhom.interop.step_order import Refusal, Rows, put_in_order
@@ -141,9 +141,10 @@ def demonstrations_of_table(
     for role in needed:
         if role not in fields:
             raise ValueError(f"column {role!r} is missing (there is {listed(fields)})")
+        checks.require_shape(f"column {role!r}", fields[role], "[T, ...]", fields[role].ndim >= 1)
     fields = _filled(table, fields)
     infos = field(table, "infos")  # imitation's
-    if "truncated" not in fields and infos is not None and len(infos) == len(fields["state"]):
+    if "truncated" not in fields and hasattr(infos, "__len__") and len(infos) == len(fields["state"]):
         fields["truncated"] = np.array([is_time_limit(info) for info in infos])
     if any(fields[role].ndim == 2 for role in _FLAGS if role in fields):
         fields = _one_after_the_other(fields)
@@ -170,7 +171,7 @@ def _holds_episodes(states: np.ndarray, actions: np.ndarray) -> bool:
     """Whether the rows of a table are episodes rather than steps: each holds a sequence of actions, or writes one."""
     if actions.ndim == 2:
         return actions.shape[1] > 1 and states.ndim >= 2 and states.shape[1] - actions.shape[1] in (0, 1)
-    return actions.dtype == object and isinstance(_cell(actions[0]), tuple | list | np.ndarray)
+    return actions.dtype.kind in "OU" and len(actions) > 0 and isinstance(_cell(actions[0]), tuple | list | np.ndarray)
 
 
 def _one_a_row(table: Any, columns: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -233,7 +234,7 @@ def _one_after_the_other(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 
 def _is_missing(column: np.ndarray) -> np.ndarray:
-    """bool [T], where a column of actions holds none: an empty field, or what stands for it in data frames."""
+    """bool [T], where a column holds nothing: an empty field, or what stands for it in data frames."""
     if column.dtype.kind in "OUS" and column.ndim == 1:
         return np.array([str(cell).strip().lower() in NO_ACTION for cell in column], bool)
     if column.dtype.kind == "f":
@@ -241,7 +242,12 @@ def _is_missing(column: np.ndarray) -> np.ndarray:
     return np.zeros(len(column), bool)
 
 
-def _in_order(columns: Mapping[str, np.ndarray], has_action: np.ndarray) -> Rows:
+def _in_order(columns: dict[str, np.ndarray], has_action: np.ndarray) -> Rows:
+    """The rows of each episode in order; `step` and `episode` are checked first."""
+    if "step" in columns:
+        columns["step"] = Numbering("step").indices("step", columns["step"])
+    if "episode" in columns and (missing := _is_missing(columns["episode"])).any():
+        raise ValueError(f"episode[{missing.argmax()}] is missing")
     try:
         return put_in_order(columns, has_action)
     except Refusal as refusal:

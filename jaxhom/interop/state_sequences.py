@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.import_reports import ImportReport, with_report
+from jaxhom.interop.import_reports import ImportReport, require_some, with_report
 from jaxhom.interop.numbering import numberings
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
@@ -74,6 +74,7 @@ def inferred_actions(
     mdp: MDP, sequences: Sequence[Int[np.ndarray, " H"]], names: Sequence[int | str], ambiguous: str
 ) -> tuple[Demonstrations, ImportReport]:
     """`demonstrations_from_states` of checked states, [H + 1] each; `names` is what the report calls the sequences."""
+    require_some(len(sequences), ())
     lengths = np.array([max(len(states) - 1, 0) for states in sequences], np.int64)
     before = np.concatenate([np.zeros(0, np.int64), *(states[:-1] for states in sequences)])
     after = np.concatenate([np.zeros(0, np.int64), *(states[1:] for states in sequences)])

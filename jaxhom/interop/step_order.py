@@ -151,4 +151,4 @@ def _require_consistent(columns, has_action, former, later) -> None:
 def _equal(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """bool [T], which rows of two arrays [T, ...] are equal."""
     same = np.asarray(left == right)
-    return np.all(same.reshape(len(same), -1), axis=1)
+    return np.all(same, axis=tuple(range(1, same.ndim)))

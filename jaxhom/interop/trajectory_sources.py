@@ -88,6 +88,8 @@ def demonstrations_from(
         return _from_path(pathlib.Path(source), options)
     except FileError:
         raise
+    except FileNotFoundError:
+        raise FileError(f"{source}: no such file") from None
     except OSError as error:
         raise FileError(f"{source}: {error.strerror or error}") from None
     except ValueError as error:
@@ -142,7 +144,9 @@ def _from_folder(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstra
         splits = _json(path / "dataset_dict.json").get("splits")
         if not isinstance(splits, list) or not splits:
             raise FileError(f"{path / 'dataset_dict.json'}: names no splits")
-        return _from_folder(path / _split(splits), options)
+        path = path / _split(list(map(str, splits)))
+        if not path.is_dir():
+            raise FileError(f"{path}: no such folder")
     if (path / "state.json").is_file():
         files = _json(path / "state.json").get("_data_files")
         try:
@@ -195,7 +199,7 @@ def _cut_at_indices(arrays: dict[str, np.ndarray], options: dict[str, Any]) -> t
     indices = checks.require_integers("indices", arrays.pop("indices"), 2**31)
     roles = find_columns(list(arrays), options["columns"])
     states, actions = (list(arrays.values())[roles[role]] for role in ("state", "action"))
-    count = len(indices) + 1
+    count = indices.size + 1
     if indices.ndim != 1 or states.ndim < 1 or actions.ndim < 1 or len(states) != len(actions) + count:
         shapes = f"{states.shape}, {actions.shape} and {indices.shape}"
         raise ValueError(f"observations, actions and indices must be as many as {count} episodes need, got {shapes}")

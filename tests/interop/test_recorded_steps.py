@@ -121,7 +121,15 @@ def test_blackjack_by_random_play():
 
 @pytest.mark.parametrize("support", ["observed", "all"])
 def test_ends_are_absorbing(support):
-    steps = {"terminated": [False, True, True], "rewards": [1.0, 2.0, 6.0]}
+    options = {"num_states": 3, "discount": 0.9, "support": support}
+    options |= {"terminated": [False, True, True], "rewards": [1.0, 2.0, 6.0]}
+    model = from_samples([0, 1, 1], [0, 0, 0], [1, 2, 2], num_actions=2, **options)
+    assert model.mdp.state_names is None and model.terminal.tolist() == [False, False, True]
+    np.testing.assert_array_equal(model.mdp.transition[2], [[0, 0, 1]] * 2)
+    np.testing.assert_array_equal(model.reward, [[1, 0], [4, 0], [0, 0]])
+    np.testing.assert_array_equal(model.mdp.initial, [0.5, 0.5, 0.0])
+    np.testing.assert_array_equal(model.expected_l1_error[2], 0.0)
+    features, initial = np.arange(6.0).reshape(3, 2), [0.0, 1.0, 0.0]
     given = {"features": features, "initial": initial, "end_state": True}
     model = from_samples([0, 1, 1], [0, 0, 0], [1, 2, 0], num_actions=1, **options, **given)
     np.testing.assert_array_equal(model.mdp.features[:, 0], [*features, [0, 0]])
@@ -179,7 +187,6 @@ def test_bad_recordings_are_refused(changes, message):
         "states": ["a", "b", "a"],
         "actions": [0, 1, 0],
         "next_states": ["b", "c", "b"],
-        "discount": 0.9,
         **changes,
     }
     columns = [given.pop(name) for name in ("states", "actions", "next_states")]

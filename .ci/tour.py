@@ -3,8 +3,11 @@
 import os
 import tempfile
 
+import h5py
 import jax
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 
 import jaxhom
 from jaxhom import interop, plotting
@@ -43,4 +46,10 @@ assert np.isfinite(np.asarray(gradient)).all()
 with tempfile.TemporaryDirectory() as folder:
     interop.save_mdp(os.path.join(folder, "model.npz"), lake.mdp)
     assert interop.load_mdp(os.path.join(folder, "model.npz")).num_states == 16
+    rows = pyarrow.table({"obs": [[0, 1, 2], [4, 8]], "acts": [[2, 2], [1]]})
+    pyarrow.parquet.write_table(rows, os.path.join(folder, "rows.parquet"))
+    with h5py.File(os.path.join(folder, "steps.hdf5"), "w") as file:
+        file["observations"], file["actions"], file["terminals"] = [0, 1, 4], [2, 2, 1], [False, True, True]
+    for name in ("rows.parquet", "steps.hdf5"):
+        assert len(interop.demonstrations_from(os.path.join(folder, name), mdp=lake.mdp)[0]) == 2
     plotting.plot_policy(world, learned.policy).figure.savefig(os.path.join(folder, "policy.png"))

@@ -2,9 +2,11 @@
 
 * `from_gymnasium`, `make_environment`: an environment with a transition table, with its reward.
 * `from_mdptoolbox`, `from_scipy`: transition matrices.
-* `from_samples`: recorded transitions, with the uncertainty of each row.
-* `demonstrations_from_episodes`, `demonstrations_from_steps`, `demonstrations_from_csv`: trajectories of `imitation`,
-  Minari, arrays and CSV files, with a report of what was dropped; `answers_from_csv`: answers about single states.
+* `from_samples`: recorded transitions of environments without a table, with the uncertainty of each row.
+* `demonstrations_from`: trajectories from a file, a folder or an object, with a report of what was dropped. What it
+  goes through are `demonstrations_from_csv` (text), `demonstrations_from_episodes` (`imitation`, Minari, pairs),
+  `demonstrations_from_steps`, `demonstrations_from_transitions` (flat arrays) and `demonstrations_from_states` (states
+  without actions). `answers_from_csv`: answers about single states.
 * `save_*`, `load_*`: models, demonstrations and policies in `.npz` files, and whatever else is in these.
 
 Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` itself. No other library is imported

@@ -1,7 +1,7 @@
 """Demonstrations from wherever they are kept: one door to files, saved data sets, tables and objects of many kinds.
 
-What a file is, its first bytes say. Nothing is ever unpickled: a pickle can run any code on the machine that reads it.
-What other libraries save is read by `saved_tables`.
+What a file is, its first bytes say, or else the end of its name. Nothing is ever unpickled: a pickle can run any code
+on the machine that reads it. What other libraries save is read by `saved_tables`.
 """
 
 from __future__ import annotations
@@ -130,11 +130,12 @@ def _from_path(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstrati
         return _from_folder(path, options)
     with open(path, "rb") as file:
         begin = file.read(8)
-    for magic, read in _READERS.items():
-        if begin.startswith(magic):
-            return read(path, options)
-    if begin[:1] == b"\x80" and begin[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
+    kind = path.suffix.lower()
+    if kind in _PICKLES or (begin[:1] == b"\x80" and begin[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05")):
         raise FileError(f"{path}: {_PICKLED}")
+    for magic, (kinds, read) in _READERS.items():
+        if begin.startswith(magic) or kind in kinds:
+            return read(path, options)
     return demonstrations_from_csv(path, **options)
 
 
@@ -158,7 +159,7 @@ def _from_folder(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstra
         return _from_columns(arrow_columns(paths, _is_wanted(options)), options)
     for recording in (path / "data" / "main_data.hdf5", path / "main_data.hdf5"):
         if recording.is_file():
-            return _from_columns(hdf5_columns(recording, _is_wanted(options)), options)
+            return _of_hdf5(recording, options)
     raise FileError(f"{path}: a folder, but not one that imitation, datasets or Minari (in HDF5) saves a data set in")
 
 
@@ -224,10 +225,26 @@ def _is_wanted(options: dict[str, Any]) -> Callable[[str], bool]:
     return lambda name: plain(name) in KNOWN | given
 
 
-_READERS: Mapping[bytes, Callable[[pathlib.Path, dict[str, Any]], tuple[Demonstrations, ImportReport]]] = {
-    b"PK\x03\x04": _from_archive,
-    b"PAR1": lambda path, options: _from_columns(parquet_columns(path, _is_wanted(options)), options),
-    b"ARROW1": lambda path, options: _from_columns(arrow_columns([path], _is_wanted(options)), options),
-    b"\xff\xff\xff\xff": lambda path, options: _from_columns(arrow_columns([path], _is_wanted(options)), options),
-    b"\x89HDF\r\n\x1a\n": lambda path, options: _from_columns(hdf5_columns(path, _is_wanted(options)), options),
+def _of_arrow(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstrations, ImportReport]:
+    return _from_columns(arrow_columns([path], _is_wanted(options)), options)
+
+
+def _of_parquet(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstrations, ImportReport]:
+    return _from_columns(parquet_columns(path, _is_wanted(options)), options)
+
+
+def _of_hdf5(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstrations, ImportReport]:
+    return _from_columns(hdf5_columns(path, _is_wanted(options)), options)
+
+
+_Reader = Callable[[pathlib.Path, dict[str, Any]], tuple[Demonstrations, ImportReport]]
+# By their first bytes, and by the ends of their names, so that damaged files are called by their kind.
+_READERS: Mapping[bytes, tuple[tuple[str, ...], _Reader]] = {
+    b"PK\x03\x04": ((".npz",), _from_archive),
+    b"\x93NUMPY": ((".npy",), _from_archive),
+    b"PAR1": ((".parquet",), _of_parquet),
+    b"ARROW1": ((".arrow", ".feather"), _of_arrow),
+    b"\xff\xff\xff\xff": ((), _of_arrow),
+    b"\x89HDF\r\n\x1a\n": ((".hdf5", ".h5"), _of_hdf5),
 }
+_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")

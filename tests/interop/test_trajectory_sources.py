@@ -406,6 +406,31 @@ def test_hdf5_files(tmp_path):
         demonstrations_from(tmp_path / "cut.h5")
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("steps.npz", b"", "not a readable .npz archive"),
+        ("steps.npz", b"episode,state,action\n", "not a readable .npz archive"),
+        ("steps.npy", b"\x93NUMPY", "not a readable .npz archive"),
+        ("steps.pkl", b"(lp0\n.", "a pickle, which can run any code"),
+        ("steps", b"\x80\x04\x95", "a pickle, which can run any code"),
+        ("steps", b"", "column 'state' is missing"),
+        ("steps.csv", b"\0\0", "not a text file in UTF-8"),
+    ],
+)
+def test_files_of_another_kind_are_named(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FileError, match=re.escape(message)) as raised:
+        demonstrations_from(tmp_path / name)
+    assert str(tmp_path / name) in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_one_array_is_no_archive(tmp_path):
+    np.save(tmp_path / "steps.npy", [0, 1])
+    with pytest.raises(FileError, match=r"steps.npy: one array, not an .npz archive of named arrays"):
+        demonstrations_from(tmp_path / "steps.npy")
+
+
 @pytest.mark.parametrize("name", ["gone.csv", "gone.npz", "gone"])
 def test_missing_files_are_named(tmp_path, name):
     with pytest.raises(FileError, match=f"{name}: no such file"):

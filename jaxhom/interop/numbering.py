@@ -78,6 +78,8 @@ class Numbering:
 
     def _named(self, name: str, values: Any) -> np.ndarray | None:
         """The indices of texts and names; None where the values are indices rather than names."""
+        if np.ndim(values) == 0 if isinstance(values, np.ndarray) else not isinstance(values, Iterable):
+            return None
         keys = keys_of(values)
         if not self._has_numbers and all(isinstance(key, int | float) for key in keys):
             return None

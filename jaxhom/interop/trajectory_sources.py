@@ -26,6 +26,7 @@ from jaxhom.interop.trajectories import read_episodes
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
 
+_OLD = ("obs", "acts", "indices")  # of `imitation`'s archives of old
 _PICKLED = (
     "a pickle, which can run any code when it is read, so it is not opened: where you trust it, load it yourself and "
     "pass what it holds to demonstrations_from"
@@ -166,7 +167,7 @@ def _from_folder(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstra
 def _json(path: pathlib.Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_bytes())
-    except ValueError:
+    except (ValueError, RecursionError):
         raise FileError(f"{path}: not a readable JSON file") from None
     return content if isinstance(content, dict) else {}
 
@@ -177,16 +178,19 @@ def _from_archive(path: pathlib.Path, options: dict[str, Any]) -> tuple[Demonstr
     roles = find_columns(names, options["columns"])
     needed = {"state"} if options["mdp"] is not None else {"state", "action"}
     if {"states", "actions"} <= set(names) <= {*DEMONSTRATIONS, "format_version"} or not needed <= set(roles):
-        return _own(load_demonstrations(path))
-    wanted = {names[place] for place in roles.values()} | ({"indices"} & set(names))
-    arrays = load_arrays(path, *wanted)
-    if "indices" in arrays:
-        return _cut_at_indices(arrays, options)
+        return _own(load_demonstrations(path), options["mdp"])
+    if set(_OLD) <= set(names):
+        arrays = load_arrays(path, *_OLD)
+        demonstrations, report = _cut_at_indices(arrays, options)
+        return demonstrations, dataclasses.replace(report, unread=tuple(n for n in names if n not in _OLD))
+    arrays = load_arrays(path, *(names[place] for place in roles.values()))
     return _from_table(arrays, names, options)
 
 
-def _own(demonstrations: Demonstrations) -> tuple[Demonstrations, ImportReport]:
+def _own(demonstrations: Demonstrations, mdp: MDP | None) -> tuple[Demonstrations, ImportReport]:
     """Demonstrations that this library wrote, and the report of them."""
+    if mdp is not None:
+        demonstrations.validate(mdp, "ignore")
     steps, known = np.asarray(demonstrations.mask).sum(), np.asarray(demonstrations.final_states) >= 0
     report = ImportReport(len(demonstrations), int(steps), int(known.sum()), dropped=())
     return demonstrations, report
@@ -197,9 +201,8 @@ def _cut_at_indices(arrays: dict[str, np.ndarray], options: dict[str, Any]) -> t
 
     Whether a time limit ended an episode stands in pickled `infos`, so none counts as terminated.
     """
-    indices = checks.require_integers("indices", arrays.pop("indices"), 2**31)
-    roles = find_columns(list(arrays), options["columns"])
-    states, actions = (list(arrays.values())[roles[role]] for role in ("state", "action"))
+    states, actions, indices = (arrays[name] for name in _OLD)
+    indices = checks.require_integers("indices", indices, 2**31)
     count = indices.size + 1
     if indices.ndim != 1 or states.ndim < 1 or actions.ndim < 1 or len(states) != len(actions) + count:
         shapes = f"{states.shape}, {actions.shape} and {indices.shape}"
@@ -208,8 +211,11 @@ def _cut_at_indices(arrays: dict[str, np.ndarray], options: dict[str, Any]) -> t
     if (np.diff(ends, prepend=0) < 0).any():
         raise ValueError(f"indices must ascend up to the number of actions, {len(actions)}")
     episodes = zip(np.split(states, indices + np.arange(1, count)), np.split(actions, indices), strict=True)
-    pairs = [{"state": states, "action": actions} for states, actions in episodes]
-    return read_episodes(pairs, mdp=options["mdp"], to_states=options["to_states"])
+    return read_episodes(
+        [{"state": states, "action": actions} for states, actions in episodes],
+        mdp=options["mdp"],
+        to_states=options["to_states"],
+    )
 
 
 def _from_columns(read: Columns | list[dict[str, Any]], options: dict[str, Any]) -> tuple[Demonstrations, ImportReport]:

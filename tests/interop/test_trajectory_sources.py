@@ -176,6 +176,9 @@ def test_names_of_the_model():
     episodes = [(np.array([[0, 1], [0, 0]]), ["up"]), ([[0, 1], [0, 2]], [0])]
     demonstrations, report = demonstrations_from(episodes, mdp=mdp)
     assert pairs(demonstrations) == [([1, 0], [0])]
+    for broken in (5, np.array(5), None):
+        with pytest.raises(ValueError, match="episode 0: observations must have shape"):
+            demonstrations_from([(broken, [0])], mdp=mdp)
     assert report.dropped == ((1, "observations[1]: there is no state (0, 2); did you mean (0, 1) or (0, 0)?"),)
 
 
@@ -256,13 +259,24 @@ ARCHIVES = {
 }
 
 
+UNREAD = {"expert": ("rewards", "episode_returns"), "imitation of old": ("infos", "terminal")}
+
+
+def test_our_own_archives_are_of_the_model(tmp_path):
+    ring = MDP.from_dense(np.eye(3)[[[0, 1], [1, 2], [2, 0]]], discount=0.9)
+    ARCHIVES["our own"][0](tmp_path / "steps.npz")
+    with pytest.raises(FileError, match=r"steps.npz: states\[1, 0\] must lie in \[0, 3\)"):
+        demonstrations_from(tmp_path / "steps.npz", mdp=ring)
+
+
 @pytest.mark.parametrize("name", ARCHIVES)
 @pytest.mark.parametrize("file", ["steps.npz", "steps"])
 def test_archives(tmp_path, name, file):
     write, expected = ARCHIVES[name]
     write(tmp_path / "steps.npz")
     (tmp_path / "steps.npz").rename(tmp_path / file)
-    demonstrations, _ = demonstrations_from(tmp_path / file)
+    demonstrations, report = demonstrations_from(tmp_path / file)
+    assert report.unread == UNREAD.get(name, ())
     assert pairs(demonstrations) == (expected or [([0, 2], [1, 0]), ([3, 1], [0, 1])])
 
 

@@ -1,12 +1,13 @@
 """What the columns of recorded steps are called: the roles, the usual names for each, and which column has which.
 
-Case, blanks and dashes in names do not count. The same names are understood in text files, data frames, dictionaries,
-archives of arrays and objects.
+Case, blanks, dashes and underscores in names do not count. The same names are understood in text files, data frames,
+dictionaries, archives of arrays and objects.
 """
 
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -29,7 +30,17 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 # Names that mean a role only where no other column does.
 WEAK: Mapping[str, tuple[str, ...]] = {"episode": ("id",), "terminated": ("done", "dones")}
 ROLES = tuple(NAMES)
-KNOWN = frozenset().union(*NAMES.values(), *WEAK.values())
+
+
+def plain(name: object) -> str:
+    """A column's name without what does not count: `NextState`, `next state` and `next_state` are one."""
+    return re.sub(r"[ _-]", "", str(name).strip()).lower()
+
+
+_PLAIN = {role: frozenset(map(plain, names)) for role, names in NAMES.items()}
+_PLAIN_WEAK = {role: frozenset(map(plain, names)) for role, names in WEAK.items()}
+KNOWN = frozenset().union(*_PLAIN.values(), *_PLAIN_WEAK.values())
+_ATTRIBUTES = tuple(sorted(set().union(*NAMES.values(), *WEAK.values())))
 
 
 def fields_by_role(source: Any, columns: Mapping[str, str] | None = None) -> dict[str, Any]:
@@ -43,7 +54,7 @@ def fields_by_role(source: Any, columns: Mapping[str, str] | None = None) -> dic
         found = _found(tuple(map(str, names)), tuple(sorted((columns or {}).items())))
         fields = {role: source[names[place]] for role, place in found.items()}
     else:
-        names = [name for name in sorted({*KNOWN, *(columns or {}).values()}) if _is_field(source, name)]
+        names = [name for name in (*_ATTRIBUTES, *(columns or {}).values()) if _is_field(source, name)]
         found = _found(tuple(names), tuple(sorted((columns or {}).items())))
         fields = {role: getattr(source, names[place]) for role, place in found.items()}
     return {role: field for role, field in fields.items() if field is not None}
@@ -106,16 +117,11 @@ def _places(names: Sequence[str], role: str, columns: Mapping[str, str]) -> list
         if not found:
             raise ValueError(f"columns[{role!r}]: there is no column {columns[role]!r}, but {listed(names)}")
         return found
-    for known in (NAMES[role], WEAK.get(role, ())):
+    for known in (_PLAIN[role], _PLAIN_WEAK.get(role, frozenset())):
         found = [place for place, name in enumerate(names) if name in known and name not in taken]
         if found:
             return found
     return []
-
-
-def plain(name: object) -> str:
-    """A column's name without what does not count."""
-    return str(name).strip().lower().replace(" ", "_").replace("-", "_")
 
 
 def listed(names: Iterable[str]) -> str:

@@ -98,6 +98,8 @@ def _append(table: Table, part: list[tuple[int, list[str]]]) -> None:
     """Adds rows to a table; raises at the first with more fields than columns, unless the rest are empty."""
     width = len(table.header)
     for line, row in part:
+        if len(row) > width:
+            _join_brackets(row, table.delimiter or " ")
         if len(row) > width and any(field.strip() for field in row[width:]):
             raise FileError(f"{table.path} line {line}: {len(row)} fields, but the first line names {width} columns")
     lines, rows = zip(*part, strict=True)
@@ -106,6 +108,20 @@ def _append(table: Table, part: list[tuple[int, list[str]]]) -> None:
         column.extend(cells)
     for column in table.columns:  # those that all these rows end before
         column.extend([None] * (len(table.lines) - len(column)))
+
+
+def _join_brackets(row: list[str], delimiter: str) -> None:
+    """Makes one field of what stands between brackets: `(0,1)` is often written without quotes."""
+    fields: list[str] = []
+    depth = 0
+    for field in row:
+        if depth > 0:
+            fields[-1] += delimiter + field
+        else:
+            fields.append(field)
+        depth += sum(field.count(mark) for mark in "([{") - sum(field.count(mark) for mark in ")]}")
+    if depth == 0:
+        row[:] = fields
 
 
 def _delimiter(line: str, given: set[str]) -> str | None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.column_names import find_columns, listed, plain
+from jaxhom.interop.column_names import find_columns, listed
 from jaxhom.interop.csv_rows import Table, read_table
 from jaxhom.interop.files import FileError
 from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport
@@ -123,7 +123,7 @@ def places_of(table: Table, needed: Sequence[str], columns: Mapping[str, str] | 
         raise FileError(f"{table.path} line 1: {error}") from None
     for role in needed:
         if role not in places:
-            found = listed(map(plain, table.header))
+            found = listed(name.strip().lower() for name in table.header)
             raise FileError(
                 f"{table.path} line 1: column {role!r} is missing; the first line must name the columns, got {found}"
             )

@@ -129,6 +129,19 @@ def test_names_of_states_and_actions(read):
     assert pairs(demonstrations) == [([0, 1, 1, 2, 2], [0, 1, 0, 1])]
 
 
+@pytest.mark.parametrize("delimiter", [",", ", ", " "])
+def test_tuples_without_quotes(read, delimiter):
+    """As programs write them that do not think of it."""
+    header = delimiter.join(["Episode", "Step", "State", "Action", "Reward", "NextState", "Done"])
+    lines = ["1 1 (0,1) run -1.0 new False", "1 2 new 1 0.5 (0,1) True"]
+    text = "\n".join([header, *(line.replace(" ", delimiter) for line in lines)])
+    demonstrations, report = read(text, mdp=named_machine())
+    assert pairs(demonstrations) == [([1, 0, 1], [0, 1])] and demonstrations.terminated.tolist() == [True]
+    assert report.unread == ("Reward",)
+    with pytest.raises(FileError, match="line 2: 4 fields, but the first line names 3 columns"):
+        read("episode,state,action\n0,(0,(1,1\n")
+
+
 def test_numbers_that_are_names_are_no_indices(read):
     mdp = named_machine().replace(state_names=[10, 20, 1])
     assert pairs(read("episode,state,action\n0,1,0\n0,20,1\n0,10.0,\n", mdp=mdp)[0]) == [([2, 1, 0], [0, 1])]

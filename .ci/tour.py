@@ -3,9 +3,12 @@
 import os
 import tempfile
 
+import h5py
 import jax
 import networkx
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 
 import jaxhom
 from jaxhom import interop, plotting
@@ -47,4 +50,10 @@ with tempfile.TemporaryDirectory() as folder:
     roads = networkx.path_graph(3).to_directed()
     networkx.write_graphml(roads, os.path.join(folder, "roads.graphml"))
     assert interop.read_model(os.path.join(folder, "roads.graphml")).mdp.num_states == 4
+    rows = pyarrow.table({"obs": [[0, 1, 2], [4, 8]], "acts": [[2, 2], [1]]})
+    pyarrow.parquet.write_table(rows, os.path.join(folder, "rows.parquet"))
+    with h5py.File(os.path.join(folder, "steps.hdf5"), "w") as file:
+        file["observations"], file["actions"], file["terminals"] = [0, 1, 4], [2, 2, 1], [False, True, True]
+    for name in ("rows.parquet", "steps.hdf5"):
+        assert len(interop.demonstrations_from(os.path.join(folder, name), mdp=lake.mdp)[0]) == 2
     plotting.plot_policy(world, learned.policy).figure.savefig(os.path.join(folder, "policy.png"))

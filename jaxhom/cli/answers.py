@@ -14,7 +14,7 @@ import numpy as np
 from jaxhom.cli.questions import action_names, mark, name_of
 from jaxhom.cli.results import Results
 from jaxhom.cli.sources import Problem
-from jaxhom.interop.csv_steps import answers_from_csv, append_answer
+from jaxhom.interop.csv_answers import answers_from_csv, append_answer
 from jaxhom.models.demonstrations import Demonstrations
 
 _STOP = "q"

@@ -81,7 +81,7 @@ def add_demonstration_options(parser: Parser) -> None:
     """Where the trajectories come from."""
     group = parser.add_argument_group("demonstrations")
     source = group.add_mutually_exclusive_group(required=True)
-    source.add_argument("--demonstrations", metavar="FILE", help="the expert's trajectories, .npz or .csv")
+    source.add_argument("--demonstrations", metavar="PATH", help="the expert's trajectories: .npz, .csv and more")
     source.add_argument(
         "--expert", type=positive, metavar="N", help="sample N from the optimal policy, if the model has a reward"
     )
@@ -98,6 +98,12 @@ def add_demonstration_options(parser: Parser) -> None:
         choices=("refuse", "warn", "ignore"),
         default="warn",
         help="what to do about demonstrated steps that the model gives probability 0 (default warn)",
+    )
+    group.add_argument(
+        "--ambiguous",
+        choices=("hide", "likeliest", "refuse"),
+        default="hide",
+        help="trajectories without actions: what to do about steps that several actions could have been (default hide)",
     )
 
 

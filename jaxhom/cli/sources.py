@@ -23,13 +23,13 @@ from jaxhom.cli.options import environment_options
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.domains.track_maps import SHIPPED
-from jaxhom.interop.csv_steps import demonstrations_from_csv
 from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environment_maps import tile_map
 from jaxhom.interop.environment_tables import require_steps_of_table
 from jaxhom.interop.environments import from_gymnasium
-from jaxhom.interop.files import FileError, load_demonstrations, load_policy
+from jaxhom.interop.files import FileError, load_policy
 from jaxhom.interop.model_files import DISCOUNT, read_model
+from jaxhom.interop.trajectory_sources import demonstrations_from
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
 from jaxhom.models.inputs import check_policy
@@ -250,23 +250,23 @@ def load_trajectories(problem: Problem, options: argparse.Namespace) -> tuple[De
         return _sample(problem, options), f"sampled from the optimal policy (seed {options.seed})"
     if options.steps is not None:
         raise ValueError("--steps belongs to --expert")
-    return load_demonstrations_of(problem, options.demonstrations, options.impossible)
+    return load_demonstrations_of(problem, options.demonstrations, options.impossible, options.ambiguous)
 
 
-def load_demonstrations_of(problem: Problem, path: str, impossible: str = "refuse") -> tuple[Demonstrations, str]:
-    """Trajectories in the problem's model, from a .csv or .npz file, and what was read, in words.
+def load_demonstrations_of(
+    problem: Problem, path: str, impossible: str = "refuse", ambiguous: str = "hide"
+) -> tuple[Demonstrations, str]:
+    """Trajectories in the problem's model, from whatever `demonstrations_from` reads, and what was read, in words.
 
-    Steps of probability 0 are refused, told on stderr ("warn") or let pass ("ignore").
+    Steps of probability 0 are refused, told on stderr ("warn") or let pass ("ignore"). What happens to steps that
+    several actions could have been, in a file of states alone, `demonstrations_from_states` says.
 
     Raises:
       FileError: naming the file, and line and column or the array's entry.
+      ImportError: if an optional library is missing.
     """
-    origin = path
-    if path.lower().endswith(".csv"):
-        demonstrations, report = demonstrations_from_csv(path, mdp=problem.mdp)
-        origin = "; ".join([path, *str(report).splitlines()])
-    else:
-        demonstrations = load_demonstrations(path)
+    demonstrations, report = demonstrations_from(path, mdp=problem.mdp, ambiguous=ambiguous)
+    origin = "; ".join([path, *str(report).splitlines()])
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", ImpossibleStepsWarning)

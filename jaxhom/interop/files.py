@@ -12,7 +12,7 @@
     beside a model  reward            [S, A] or [S]                                   all optional,
                     coordinates       [S, D], positions of the states                 read by the
                     terminal          bool [S], where episodes end                    command line
-    demonstrations  states, actions   integers [M, H] (or [H] for one trajectory)
+    demonstrations  states, actions   integers [M, H] (or [H] for one trajectory); an action of -1: not known, hidden
                     length            integers [M], optional: steps of each trajectory; H if missing
                     terminated        bool [M], optional: whether its episode ended; False if missing
                     final_states      integers [M], optional: the state after the last step; -1: unknown
@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float, Shaped
 
 FORMAT_VERSION = 1
+DEMONSTRATIONS = ("states", "actions", "length", "terminated", "final_states", "is_answer")
 _ALONE = "marks a trajectory of more than one step"
 
 
@@ -116,16 +117,19 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         length = arrays.get("length", np.full(count, horizon))
         checks.require_shape("length", length, f"({count},)", length.shape == (count,))
         length = checks.require_integers("length", length, upper=horizon + 1)
+        steps = np.arange(horizon) < length[:, None]
+        mask = steps & (actions != -1)
         final = arrays.get("final_states", np.full(count, -1))
         checks.require_shape("final_states", final, f"({count},)", final.shape == (count,))
-        rows = zip(states, actions, length, final, strict=True)
+        rows = zip(states, np.where(steps & ~mask, 0, actions), length, final, strict=True)
         trajectories = [(np.append(s[:n], z) if z != -1 else s[:n], a[:n]) for s, a, n, z in rows]
         is_answer = arrays.get("is_answer", np.zeros(count, bool))
         checks.require_all(
             "is_answer", is_answer, ~require_flags("is_answer", is_answer, count) | (length == 1), _ALONE
         )
         demonstrations = Demonstrations.from_trajectories(trajectories, terminated=arrays.get("terminated"))
-        return demonstrations.replace(is_answer=checks.to_device(is_answer))
+        mask = checks.to_device(mask[:, : demonstrations.horizon])
+        return demonstrations.replace(mask=mask, is_answer=checks.to_device(is_answer))
     except ValueError as error:
         raise FileError(f"{path}: {error}") from None
 
@@ -134,7 +138,7 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
     """Reads those of the named arrays that a file holds, whatever else is in it; their values are not checked.
 
     Raises:
-      FileError: if the file is missing, truncated or of another kind.
+      FileError: if the file is missing, truncated or of another kind, or one of the arrays holds pickled objects.
 
     Outside jit, vmap and grad only.
 
@@ -145,8 +149,17 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
       >>> load_arrays(path, "reward", "terminal")
       {'reward': array([0., 1.])}
     """
-    arrays = _read(path)
-    return {name: arrays[name] for name in names if name in arrays}
+    return _read(path, names)
+
+
+def names_of_arrays(path: str | os.PathLike) -> list[str]:
+    """The names of all arrays in an archive.
+
+    Raises:
+      FileError: as `load_arrays`.
+    """
+    with _archive(path) as archive:
+        return list(archive.files)
 
 
 def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
@@ -199,7 +212,7 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     """Writes demonstrations.
 
     Raises:
-      ValueError: if `mask` is not a prefix of every row, or leaves one empty.
+      ValueError: if `mask` leaves a trajectory without a step.
       OSError: as `save_mdp`.
 
     Outside jit, vmap and grad only.
@@ -212,14 +225,13 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
       [[0, 1]]
     """
     mask = np.asarray(demonstrations.mask)
-    length = mask.sum(axis=1)
-    prefix = np.arange(mask.shape[1]) < np.maximum(length, 1)[:, None]
-    checks.require_all(
-        "mask", mask, mask == prefix, "must be True on the first steps of each trajectory and only there"
-    )
+    checks.require_all("mask", mask, np.any(mask, axis=1), "must be True on one step of each trajectory at least")
+    length = mask.shape[1] - mask[:, ::-1].argmax(axis=1)
     answers = _fields(demonstrations, "is_answer") if np.asarray(demonstrations.is_answer).any() else {}
-    fields = _fields(demonstrations, "states", "actions", "terminated", "final_states")
-    _write(path, {**fields, **answers, "length": length})
+    fields = _fields(demonstrations, "states", "terminated", "final_states")
+    hidden = (np.arange(mask.shape[1]) < length[:, None]) & ~mask
+    actions = np.where(hidden, -1, demonstrations.actions)
+    _write(path, {**fields, **answers, "actions": actions, "length": length})
 
 
 def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extras: Shaped[ArrayLike, "..."]) -> None:
@@ -283,14 +295,26 @@ def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
         np.savez_compressed(file, **named)
 
 
-def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """All arrays of an archive."""
+def _read(path: str | os.PathLike, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """All arrays of an archive, or those of the given names that it holds."""
+    arrays = {}
+    with _archive(path) as archive:
+        for name in archive.files:
+            if names is None or name in names or name == "format_version":
+                arrays[name] = _array(path, archive, name)
+    _require_version(path, arrays.pop("format_version", np.asarray(FORMAT_VERSION)))
+    return arrays
+
+
+@contextlib.contextmanager
+def _archive(path: str | os.PathLike) -> Iterator[np.lib.npyio.NpzFile]:
+    """An archive that is open within the block; what is wrong with it is a `FileError`."""
     try:
         with open(path, "rb") as file:
             archive = np.load(file, allow_pickle=False)
             if isinstance(archive, np.ndarray):
                 raise FileError(f"{path}: one array, not an .npz archive of named arrays")
-            arrays = {name: archive[name] for name in archive.files}
+            yield archive
     except FileNotFoundError:
         raise FileError(f"{path}: no such file") from None
     except FileError:
@@ -298,11 +322,19 @@ def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
     except Exception as error:  # of damaged headers NumPy and the standard library raise what they come upon
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise FileError(f"{path}: not a readable .npz archive ({reason})") from None
-    for name, array in arrays.items():
-        if not isinstance(array, np.ndarray):
-            raise FileError(f"{path}: {name!r} is not a NumPy array")
-    _require_version(path, arrays.pop("format_version", np.asarray(FORMAT_VERSION)))
-    return arrays
+
+
+def _array(path: str | os.PathLike, archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray:
+    try:
+        array = archive[name]
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
+        remedy = "a pickle can run any code, so it is not opened: save plain arrays"
+        raise FileError(f"{path}: {name!r} holds pickled Python objects; {remedy}") from None
+    if not isinstance(array, np.ndarray):
+        raise FileError(f"{path}: {name!r} is not a NumPy array")
+    return array
 
 
 def _require_version(path: str | os.PathLike, version: np.ndarray) -> None:

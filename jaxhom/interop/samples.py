@@ -29,7 +29,8 @@ can be. With alpha = 0 (maximum likelihood) there is no such class, and what was
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,11 +38,12 @@ import scipy
 
 from jaxhom import checks
 from jaxhom.interop.matrices import from_scipy
+from jaxhom.interop.recorded_steps import RecordedSteps, recorded_steps, with_ends
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, ArrayLike, Float, Int
+    from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 SUPPORTS = ("observed", "all")
 
@@ -54,22 +56,29 @@ class SampledModel(Record):
       count: int32 [S, A], recorded transitions per pair; 0 where the row is all prior.
       expected_l1_error: float [S, A], posterior expectation of sum_z |P(z) - p(z)|, in [0, 2].
       standard_deviation: float [S, A], root of the posterior expectation of sum_z (P(z) - p(z))^2.
+      reward: float [S, A], the mean of the recorded rewards, 0 where there is none; None if none were given.
+      terminal: bool [S], the states in which episodes end, which are absorbing; None if no ends were given.
     """
 
     mdp: MDP
     count: Int[Array, "S A"]
     expected_l1_error: Float[Array, "S A"]
     standard_deviation: Float[Array, "S A"]
+    reward: Float[Array, "S A"] | None = None
+    terminal: Bool[Array, " S"] | None = None
 
 
 def from_samples(
-    states: Int[ArrayLike, "T"],
-    actions: Int[ArrayLike, "T"],
-    next_states: Int[ArrayLike, "T"],
+    states: Sequence[Any] | Shaped[ArrayLike, "T ..."],
+    actions: Sequence[Any] | Shaped[ArrayLike, " T"],
+    next_states: Sequence[Any] | Shaped[ArrayLike, "T ..."],
     *,
-    num_states: int,
-    num_actions: int,
+    num_states: int | None = None,
+    num_actions: int | None = None,
     discount: Float[ArrayLike, ""],
+    rewards: Float[ArrayLike, " T"] | None = None,
+    terminated: Bool[ArrayLike, " T"] | None = None,
+    end_state: bool = False,
     prior: float = 0.5,
     support: str = "observed",
     initial: Float[ArrayLike, "S"] | None = None,
@@ -78,24 +87,34 @@ def from_samples(
     """Estimates a model from transitions, and says how uncertain each of its rows is.
 
     Args:
-      states: integers [T] in [0, S), the state of each recorded transition.
-      actions: integers [T] in [0, A), the action taken there.
-      next_states: integers [T] in [0, S), the state that followed.
-      num_states: S.
-      num_actions: A.
+      states: [T], the state of each recorded transition: integers in [0, S), or, without `num_states`, observations of
+        any kind that is told apart by value: numbers, texts, tuples, arrays, dictionaries.
+      actions: [T], the action taken there: integers in [0, A), or, without `num_actions`, of any such kind.
+      next_states: [T], the state that followed.
+      num_states: S. If None, observations are numbered: as they first appear in `states`, and after these what was only
+        ever reached. The model has them as its `state_names`, by which trajectories find them again.
+      num_actions: A. If None, one more than the largest; or, of actions that are no whole numbers, as many as there
+        are, numbered as they first appear and kept as `action_names`.
       discount: scalar, strictly between 0 and 1.
+      rewards: [T], what each transition earned.
+      terminated: bool [T], which transitions ended their episode, not those that were cut off. The states that they
+        led to become absorbing.
+      end_state: True: one absorbing state is added as the last, with features and reward 0, and every terminated
+        transition leads there: where an episode can end in a state that others go on from.
       prior: alpha, the Dirichlet prior's weight per successor, in transitions; 0.5 is Jeffreys' prior, 0 (only for
         "observed") maximum likelihood.
       support: "observed" or "all": which successors a row may have (see the module's text).
-      initial: [S] distribution of the first state; uniform if None.
-      features: [S, A, K] or [S, K]; no features (K = 0) if None.
+      initial: [S] distribution of the first state; uniform over those that are not terminal if None.
+      features: [S, A, K] or [S, K], without the state that is added; no features (K = 0) if None. Where states are
+        numbered here, `model.mdp.replace(initial=..., features=...)` sets both afterwards.
 
     Returns:
       The model with counts and uncertainties.
 
     Raises:
       ValueError: on sequences of different lengths or none at all, naming the first entry that is out of range or not
-        whole, on a negative or infinite `prior` or an unknown `support`; and as `MDP.from_successors`.
+        whole, or a state in which some episodes end and others go on, unless `end_state`; on a negative or infinite
+        `prior` or an unknown `support`; and as `MDP.from_successors`.
 
     Outside jit, vmap and grad only: transitions are counted on the host.
 
@@ -105,36 +124,73 @@ def from_samples(
       >>> model = from_samples([0, 0, 0], [0, 0, 0], [1, 1, 0], num_states=2, num_actions=1, discount=0.9, prior=1.0)
       >>> model.mdp.transition[0].tolist(), model.count[:, 0].tolist()  # (2 + 1) / (3 + 2) of the mass goes to state 1
       ([[0.4, 0.6]], [3, 0])
+      >>> model = from_samples(["sea", "sea"], [0, 1], ["sea", "gold"], discount=0.9, rewards=[-1.0, 5.0])
+      >>> model.mdp.state_names, model.reward.tolist()
+      (('sea', 'gold'), [[-1.0, 5.0], [0.0, 0.0]])
     """
-    num_states = checks.require_count("num_states", num_states)
-    num_actions = checks.require_count("num_actions", num_actions)
     prior = _validated_prior(prior, support)
+    steps = recorded_steps(states, actions, next_states, num_states, num_actions)
+    if terminated is not None:
+        steps = with_ends(steps, terminated, end_state)
+    elif end_state:
+        raise ValueError("end_state needs terminated, the transitions that ended their episode")
+    if end_state:
+        initial, features = _with_end("initial", initial, steps), _with_end("features", features, steps)
+    if initial is None and steps.terminal is not None and not steps.terminal.all():
+        initial = ~steps.terminal / (~steps.terminal).sum()
+    return _model(steps, rewards, prior, support, discount=discount, initial=initial, features=features)
+
+
+def _model(steps: RecordedSteps, rewards, prior: float, support: str, **options: Any) -> SampledModel:
+    """The model of checked transitions."""
+    num_states, num_actions = steps.num_states, steps.num_actions
     checks.require_slots(num_states, num_actions, num_states if support == "all" else 1)
-    pair, successor, seen = _counts(states, actions, next_states, num_states, num_actions)
+    pair, successor, seen = _counts(steps)
     count = np.bincount(pair, weights=seen, minlength=num_states * num_actions)
     kinds = np.bincount(pair, minlength=num_states * num_actions)
+    is_end = np.zeros(len(count), bool) if steps.terminal is None else np.repeat(steps.terminal, num_actions)
     if support == "all":
         rows = np.full((len(count), num_states), prior)
         rows[pair, successor] += seen
         rows /= (count + prior * num_states)[:, None]
-        mdp = MDP.from_dense(
-            rows.reshape(num_states, num_actions, num_states), discount=discount, initial=initial, features=features
-        )
+        rows[is_end] = np.eye(num_states)[np.flatnonzero(is_end) // num_actions]
+        mdp = MDP.from_dense(rows.reshape(num_states, num_actions, num_states), **options)
     else:
         chance = (seen + prior) / (count + prior * kinds)[pair]
         alone = np.flatnonzero(count == 0)
         entries = np.append(chance, np.ones(len(alone)))
         indices = np.append(pair, alone), np.append(successor, alone // num_actions)
         matrix = scipy.sparse.csr_array((entries, indices), shape=(len(count), num_states))
-        mdp = from_scipy(matrix, discount=discount, initial=initial, features=features)
-    l1, square = _errors(pair, seen, count, kinds, num_states, prior, support)
+        mdp = from_scipy(matrix, **options)
+    mdp = mdp.replace(state_names=steps.state_names, action_names=steps.action_names)
+    l1, square = (np.where(is_end, 0.0, each) for each in _errors(pair, seen, count, kinds, num_states, prior, support))
     shape = (num_states, num_actions)
     return SampledModel(
         mdp=mdp,
         count=checks.to_device(count.reshape(shape), jnp.int32),
         expected_l1_error=checks.to_device(l1.reshape(shape), mdp.dtype),
         standard_deviation=checks.to_device(np.sqrt(square).reshape(shape), mdp.dtype),
+        reward=None if rewards is None else _mean_rewards(steps, rewards, count, mdp),
+        terminal=None if steps.terminal is None else checks.to_device(steps.terminal),
     )
+
+
+def _with_end(name: str, given: Any, steps: RecordedSteps) -> np.ndarray | None:
+    """What is given by the states, with zeros for the one that was added."""
+    if given is None:
+        return None
+    array, count = checks.as_host_array(name, given), steps.num_states - 1
+    checks.require_shape(name, array, f"({count}, ...)", array.ndim >= 1 and len(array) == count)
+    return np.pad(array, [(0, 1)] + [(0, 0)] * (array.ndim - 1))
+
+
+def _mean_rewards(steps: RecordedSteps, rewards: Any, count: np.ndarray, mdp: MDP) -> Float[Array, "S A"]:
+    array = checks.as_host_array("rewards", rewards)
+    checks.require_shape("rewards", array, f"({len(steps.states)},) like states", array.shape == steps.states.shape)
+    array = checks.require_floats_in(mdp.dtype, "rewards", array)
+    pair = steps.states * steps.num_actions + steps.actions
+    total = np.bincount(pair, weights=array, minlength=len(count))
+    return checks.to_device((total / np.maximum(count, 1)).reshape(steps.num_states, -1), mdp.dtype)
 
 
 def _validated_prior(prior, support: str) -> float:
@@ -147,22 +203,11 @@ def _validated_prior(prior, support: str) -> float:
     return float(prior)
 
 
-def _counts(states, actions, next_states, num_states: int, num_actions: int):
+def _counts(steps: RecordedSteps):
     """Distinct transitions: flat pair s * A + a, successor, and how often each was recorded."""
-    columns = []
-    for name, values, upper in (
-        ("states", states, num_states),
-        ("actions", actions, num_actions),
-        ("next_states", next_states, num_states),
-    ):
-        array = checks.as_host_array(name, values)
-        checks.require_shape(name, array, "[T] with T >= 1", array.ndim == 1 and array.size > 0)
-        columns.append(checks.require_integers(name, array, upper))
-        same = len(columns[-1]) == len(columns[0])
-        checks.require_shape(name, array, f"({len(columns[0])},) like states", same)
-    pair = columns[0] * num_actions + columns[1]
-    order = np.lexsort((columns[2], pair))
-    pair, successor = pair[order], columns[2][order]
+    pair, successor = steps.states * steps.num_actions + steps.actions, steps.next_states
+    order = np.lexsort((successor, pair))
+    pair, successor = pair[order], successor[order]
     first = np.flatnonzero(np.append(True, (np.diff(pair) != 0) | (np.diff(successor) != 0)))
     return pair[first], successor[first], np.diff(np.append(first, len(pair)))
 

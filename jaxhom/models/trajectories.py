@@ -35,12 +35,17 @@ def padded(trajectories: Iterable[Any], terminated: Bool[ArrayLike, " M"] | None
         terminated = np.zeros(len(rows), bool)
     terminated = require_flags("terminated", checks.as_host_array("terminated", terminated), len(rows))
     horizon = max(len(actions) for _, actions in rows)
-    if len(rows) * horizon > checks.MAX_SLOTS:
+    require_slots(len(rows), horizon)
+    return {**_in_rows(rows, horizon), "terminated": terminated}
+
+
+def require_slots(count: int, horizon: int) -> None:
+    """Raises if so many trajectories, padded to the longest, are too many steps for 32-bit indices."""
+    if count * horizon > checks.MAX_SLOTS:
         raise ValueError(
-            f"{len(rows)} trajectories padded to the longest, {horizon} steps, are more than 2^31 - 2 steps: "
+            f"{count} trajectories padded to the longest, {horizon} steps, are more than 2^31 - 2 steps: "
             "cut the long ones into pieces"
         )
-    return {**_in_rows(rows, horizon), "terminated": terminated}
 
 
 def _in_rows(rows: list[tuple[np.ndarray, np.ndarray]], horizon: int) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ from jaxhom.cli import answers, ask, questions
 from jaxhom.cli.parser import main
 from jaxhom.cli.sources import racetrack_problem
 from jaxhom.interop import FileError, answers_from_csv, load_demonstrations
-from jaxhom.interop.csv_steps import append_answer
+from jaxhom.interop.csv_answers import append_answer
 
 PLAIN = ["--method", "maximum-entropy", "--no-pictures"]  # uniform where nothing is known
 

@@ -1,6 +1,7 @@
 """The command line as a whole: the main job, help, and one clear line for whatever is wrong with any command."""
 
 import dataclasses
+import gzip
 import pathlib
 import re
 import shlex
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from cli_cases import LAKE, STATES, TRACK, Files
 
+import jaxhom
 from jaxhom import interop
 from jaxhom.apprenticeship.lpal import LPALSolution
 from jaxhom.cli import main_job
@@ -207,7 +209,7 @@ def test_module_runs():
         ({}, {"length": [3, 0]}, "demos.npz: trajectory 1 is empty"),
         ({}, {"length": [3, 7]}, "demos.npz: length[1] must be below 7"),
         ({}, {"format_version": 7}, "demos.npz: written in format 7"),
-        ({}, {"states": np.array([[0, None], [1, "x"]], object)}, "demos.npz: not a readable .npz archive"),
+        ({}, {"states": np.array([[0, None], [1, "x"]], object)}, "demos.npz: 'states' holds pickled Python objects"),
     ],
 )
 def test_wrong_arrays_are_one_line(files, capsys, model, demonstrations, message):
@@ -230,6 +232,47 @@ def test_truncated_archives_are_one_line(files, capsys, share):
     assert "model.npz: not a readable .npz archive" in error_of(capsys, "learn", *files.options())
 
 
+def test_trajectories_of_every_kind(in_folder, capsys):
+    """The same steps in text of other delimiters, packed, and in another library's archive."""
+    with np.load("demos.npz") as archive:
+        lengths = archive["length"]
+        lines = [
+            f"{row}\t{archive['states'][row, t]}\t{archive['actions'][row, t]}"
+            for row, length in enumerate(lengths)
+            for t in range(length)
+        ]
+        names = ("states", "actions")
+        flat = {name: np.concatenate([archive[name][r, :n] for r, n in enumerate(lengths)]) for name in names}
+    in_folder["steps.txt.gz"].write_bytes(gzip.compress("\n".join(["traj\tobs\tact", *lines]).encode()))
+    starts = np.concatenate([np.arange(n) == 0 for n in lengths])
+    np.savez("expert.npz", obs=flat["states"], actions=flat["actions"], episode_starts=starts, rewards=starts * 1.0)
+    weights = []
+    for name in ("demos.npz", "steps.txt.gz", "expert.npz"):
+        assert main(["learn", "--mdp", "model.npz", "--demonstrations", name, "--output", "p.npz"]) == 0
+        assert f"{name}; 2 episodes, 8 steps" in capsys.readouterr().out
+        weights.append(interop.load_policy("p.npz"))
+    np.testing.assert_array_equal(weights[1], weights[0])
+    np.testing.assert_array_equal(weights[2], weights[0])
+
+
+def test_trajectories_by_name_and_without_actions(in_folder, capsys):
+    """Four rooms in a row: to stay is what both actions do in the last, and only there."""
+    transition = np.eye(4)[np.array([[0, 1], [0, 2], [1, 3], [3, 3]])]
+    rooms = jaxhom.MDP.from_dense(transition, discount=0.9, state_names=["hall", "landing", "attic", "roof"])
+    interop.save_mdp("rooms.npz", rooms)
+    in_folder["walk.csv"].write_text("day;s\n1;hall\n1;landing\n1;attic\n1;roof\n1;roof\n")
+    command = ["learn", "--mdp", "rooms.npz", "--demonstrations", "walk.csv", "--output", "out", "--no-pictures"]
+    assert "walk.csv line 1: column 'episode' is missing" in error_of(capsys, *command)
+    in_folder["walk.csv"].write_text("run;s\n1;hall\n1;hall\n1;landing\n1;attic\n1;roof\n1;roof\n")
+    assert main(command) == 0
+    told = "1 episodes, 4 steps; 1 final observations; 1 steps could have been several actions"
+    assert told in capsys.readouterr().out
+    np.testing.assert_array_equal(interop.load_demonstrations("out/demonstrations.npz").actions, [[0, 1, 1, 1]])
+    assert "sequence 1, step 4: actions 0, 1 lead from" in error_of(capsys, *command, "--ambiguous", "refuse")
+    in_folder["walk.csv"].write_text("run;s\n1;hall\n1;rof\n")
+    assert "walk.csv line 3, column 's': there is no state 'rof'; did you mean 'roof'" in error_of(capsys, *command)
+
+
 CSV = "episode,state,action\n"
 
 
@@ -239,7 +282,8 @@ CSV = "episode,state,action\n"
         (CSV + "a,0,1\na,16,1\n", "bad.csv line 3, column 'state': must lie in [0, 16), got 16"),
         (CSV + "a,0,4\n", "bad.csv line 2, column 'action': must lie in [0, 4), got 4"),
         (CSV + "a,zero,1\n", "bad.csv line 2, column 'state': must be a whole number, got 'zero'"),
-        ("episode,state\na,0\n", "bad.csv line 1: column 'action' is missing"),
+        ("episode,state\na,0\na,15\n", "bad.csv: sequence a, step 0: no action leads from state 0 to state 15"),
+        ("episode,action\na,0\n", "bad.csv line 1: column 'state' is missing"),
         (CSV, "bad.csv: there are no episodes"),
     ],
 )
@@ -259,7 +303,7 @@ FEATURES = MODEL + "--features states "
         ("--mdp nowhere.npz --expert 1 --output out", "nowhere.npz: no such file"),
         ("--mdp a.foo --expert 1 --output out", "a.foo: models are .npz, .pomdp, .mdp, .tra, .csv, .tsv, .map"),
         ("--mdp bad.track --expert 1 --output out", "bad.track: track line 2, column 3: unknown letter '?'"),
-        ("--mdp model.npz --demonstrations nowhere.csv --output out", "nowhere.csv: No such file or directory"),
+        ("--mdp model.npz --demonstrations nowhere.csv --output out", "nowhere.csv: no such file"),
         ("--mdp model.npz --demonstrations nowhere.npz --output out", "nowhere.npz: no such file"),
         (MODEL + "--discount 0.9", "model.npz: it has a discount of its own, 0.99"),
         (MODEL + "--discount 1", "--discount must lie strictly between 0 and 1, got 1.0"),

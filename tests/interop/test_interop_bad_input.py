@@ -272,6 +272,7 @@ ANYTHING = st.one_of(
     ),
 )
 
+_RING = MDP.from_dense(np.eye(2)[[[0, 1], [1, 0]]], discount=0.9)
 DOORS = {
     "from_dense": lambda x, y: MDP.from_dense(x, discount=0.9, features=y),
     "from_dense, discount and initial": lambda x, y: MDP.from_dense(np.ones((1, 1, 1)), discount=x, initial=y),
@@ -288,6 +289,18 @@ DOORS = {
     "from_samples, prior": lambda x, y: interop.from_samples(
         [0], [0], [1], num_states=2, num_actions=1, discount=0.9, prior=x, support="all" if y else "observed"
     ),
+    "from_samples, anything": lambda x, y: interop.from_samples(x, y, x, discount=0.9),
+    "from_samples, ends": lambda x, y: interop.from_samples(
+        [0, 1], [0, 0], [1, 0], discount=0.9, rewards=x, terminated=y, end_state=True
+    ),
+    "demonstrations_from": lambda x, y: interop.demonstrations_from(x),
+    "demonstrations_from, table": lambda x, y: interop.demonstrations_from({"obs": x, "act": y, "episode": x}),
+    "demonstrations_from, flags": lambda x, y: interop.demonstrations_from(
+        {"s": [0, 1], "a": [0, 0], "done": x, "t": y}
+    ),
+    "demonstrations_from, states": lambda x, y: interop.demonstrations_from({"s": x, "run": y}, mdp=_RING),
+    "demonstrations_from_states": lambda x, y: interop.demonstrations_from_states(_RING, x),
+    "demonstrations_from_states, one": lambda x, y: interop.demonstrations_from_states(_RING, [x], ambiguous=y),
     "from_gymnasium": lambda x, y: interop.from_gymnasium(x if not isinstance(x, str) else None, discount=0.9),
     "from_gymnasium, table": lambda x, y: interop.from_gymnasium(
         types.SimpleNamespace(P=x, initial_state_distrib=y), discount=0.9

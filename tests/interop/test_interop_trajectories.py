@@ -139,7 +139,7 @@ def test_to_states_sees_observations_as_they_are_stored():
         (([0, -1], [0]), "observations[1] must not be negative, got -1"),
         (([0, 2**31], [0]), "observations[1] must be below 2147483647, got 2147483648"),
         (([0, 2**70], [0]), "observations must be whole numbers, got dtype object; to_states"),
-        ((["a", "b"], [0]), "observations must be whole numbers, got dtype <U1; to_states"),
+        ((["a", "b"], [0]), "observations[0]: must be a whole number, got 'a'; to_states"),
         (([[0, 1], [2]], [0]), "observations is not a rectangular array"),
         ((np.zeros((2, 3)), [0]), "observations must have shape [H] or [H, 1], got (2, 3); to_states"),
         (([0, 1], [1.5]), "actions[0] must be whole, got 1.5"),
@@ -171,15 +171,15 @@ def test_unusable_episodes_are_dropped_and_reported(episode, reason):
             "episode 1 must have obs and acts, or observations and actions, or be a pair of them; got int",
         ),
         ([([0], [0], [0.0])], "episode 0 must have obs and acts"),
-        ([{"obs": [0, 1], "actions": [0]}], "episode 0 must have obs and acts"),
+        ([{"obs": [0, 1], "moves": [0]}], "episode 0 must have obs and acts"),
         ([[(3, 1), (4, 0)]], "episode 0 could be (states, actions) or two steps (state, action)"),
         ([[[3, 1], [4, 0]]] * 3, "episode 0 could be (states, actions) or two steps"),
         ([[(3, 1), (4, 0), (2, 2)]], "episode 0 must have obs and acts"),
         (imitation([0, 1], [0]), "pass a list of episodes, or, if these are flattened transitions, use"),
         (FLAT, "flattened transitions, use demonstrations_from_transitions"),
-        ([FLAT], "episode 0 ends before its last step (dones): if these are flattened transitions"),
+        ([FLAT], "episode 0 ends before its last step (terminated): if these are flattened transitions"),
         ([vars(FLAT) | {"dones": None}], "episode 0 jumps: a next observation is not that of the next step: if"),
-        ([vars(FLAT) | {"dones": None, "next_obs": None, "timeouts": [1, 0, 0, 0, 0]}], "its last step (timeouts)"),
+        ([vars(FLAT) | {"dones": None, "next_obs": None, "timeouts": [1, 0, 0, 0, 0]}], "its last step (truncated)"),
     ],
 )
 def test_what_is_no_episode_is_an_error(episodes, message):
@@ -275,10 +275,10 @@ def test_two_million_steps_in_a_moment():
     [
         (([], [], []), "episode must have shape [T] with T >= 1, got (0,)"),
         (([[0]], [0], [0]), "episode must have shape [T] with T >= 1, got (1, 1)"),
-        (([0, 0], [0], [0, 0]), "observations must have shape (2, ...) like episode, got (1,)"),
-        (([0, 0], [0, 0], [0]), "actions must have shape (2, ...) like episode, got (1,)"),
-        (([0, None], [0, 0], [0, 0]), "episode must hold numbers or texts, got dtype object"),
-        (([0, 0], 3, [0, 0]), "observations must have shape (2, ...) like episode, got ()"),
+        (([0, 0], [0], [0, 0]), "observations must have shape (2, ...) like episode, T >= 1, got (1,)"),
+        (([0, 0], [0, 0], [0]), "actions must have shape (2, ...) like episode, T >= 1, got (1,)"),
+        (([0, None], [0, 0], [0, 0]), "episode[1] is missing"),
+        (([0, 0], 3, [0, 0]), "observations must have shape (2, ...) like episode, T >= 1, got ()"),
     ],
 )
 def test_bad_columns_are_refused(columns, message):
@@ -313,7 +313,8 @@ def read(tmp_path):
 def test_csv_files(read, text):
     demonstrations, report = read(text)
     assert trajectories(demonstrations) == EXPECTED
-    assert report == ImportReport(episodes=2, steps=4, final_observations=0, dropped=())
+    unread = ("reward",) if "reward" in text else ()
+    assert report == ImportReport(episodes=2, steps=4, final_observations=0, dropped=(), unread=unread)
 
 
 def test_csv_lines_without_action_are_final_observations(read):
@@ -334,12 +335,15 @@ def test_csv_lines_are_sorted_by_their_step(read, column):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "line 1: column 'episode' is missing; the first line must name the columns, got nothing"),
-        ("0,0,1\n", "line 1: column 'episode' is missing; the first line must name the columns, got '0', '0', '1'"),
-        ("episode;state;action\n", "column 'episode' is missing"),
-        ('"epi\nsode",state,action\n', "column 'episode' is missing"),
+        ("", "line 1: column 'state' is missing; the first line must name the columns, got nothing"),
+        ("0,0,1\n", "line 1: column 'state' is missing; the first line must name the columns, got '0', '0', '1'"),
+        (
+            "state,action\n0,1\n",
+            "line 1: column 'episode' is missing, and so is whatever else would tell episodes apart",
+        ),
+        ('"epi\nsode",state,action\n0,0,1\n', "column 'episode' is missing"),
         ("episode,state\n0,0\n", "line 1: column 'action' is missing"),
-        ("episode,state,state,action\n", "line 1: column 'state' occurs twice"),
+        ("episode,state,state,action\n", "line 1: columns 'state' and 'state' could both be the state: keep one"),
         ("episode,state,action\n", "there are no episodes"),
         ("episode,state,action\n0,1,\n", "none of 1 episodes can be used; episode 0: it has no actions"),
         ("episode,state,action\n0,0,1\n0,2\n", "line 3: 2 fields, but the first line names more columns"),
@@ -348,8 +352,9 @@ def test_csv_lines_are_sorted_by_their_step(read, column):
         ("episode,state,action,t\n0,0,1,1\n0,2,1,0\n0,2,1,1\n", "lines 2 and 4: step 1 occurs twice in its episode"),
         ("episode,state,action,t\n0,0,1,noon\n", "line 2, column 't': must be a whole number, got 'noon': the column"),
         ("episode,state,action,t\n0,0,1,0.5\n", "line 2, column 't': must be a whole number, got '0.5'"),
-        ("episode,state,action,Step\n0,0,1\n", "line 2, column 'Step': must be a whole number, got ''"),
-        ("episode,state,action,t,step\n", "line 1: columns 't' and 'step' could both number the steps: keep one"),
+        ("episode,state,action,Step\n0,0,1\n", "line 2: 3 fields, but the first line names more columns"),
+        ("episode,state,action,Step\n0,0,1,\n", "line 2, column 'Step': must be a whole number, got ''"),
+        ("episode,state,action,t,step\n", "line 1: columns 't' and 'step' could both be the step: keep one"),
         ("episode,state,action,t\n0,0,,0\n0,2,1,1\n", "line 3: a step after its episode's final observation"),
         ("episode,state,action\n0,,1\n", "line 2, column 'state': must be a whole number, got ''"),
         ("episode,state,action\n0,1.5,1\n", "line 2, column 'state': must be a whole number, got '1.5'"),
@@ -363,7 +368,7 @@ def test_csv_lines_are_sorted_by_their_step(read, column):
         ("episode,state,action\n0,1,\n0,2,1\n", "line 3: a step after its episode's final observation"),
         ('episode,state,action\n0,1,"1\n', "line 2: unexpected end of data"),
         (b"episode,state,action\n0,\xff,1\n", "not a text file in UTF-8"),
-        (b"episode,state,action\n0,0,1\x00\n", "line 2"),
+        (b"episode,state,action\n0,0,1\x00\n", "not a text file in UTF-8 (it holds zero bytes)"),
     ],
 )
 def test_bad_csv_files_name_the_line_and_the_column(read, text, message):

@@ -6,6 +6,7 @@
 * `demonstrations_from_episodes`, `demonstrations_from_steps`, `demonstrations_from_csv`: trajectories of `imitation`,
   Minari, arrays and CSV files, with a report of what was dropped; `answers_from_csv`: answers about single states.
 * `save_*`, `load_*`: models, demonstrations and policies in `.npz` files, and whatever else is in these.
+* `save_similarity`, `load_similarity`: what a table of similarities has solved, for a later process to go on from.
 
 Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` itself. No other library is imported
 before it is needed.
@@ -27,6 +28,7 @@ from jaxhom.interop.files import (
 from jaxhom.interop.import_reports import ImportReport
 from jaxhom.interop.matrices import from_mdptoolbox, from_scipy
 from jaxhom.interop.samples import SampledModel, from_samples
+from jaxhom.interop.similarity_files import load_similarity, save_similarity
 from jaxhom.interop.trajectories import (
     demonstrations_from_episodes,
     demonstrations_from_steps,
@@ -51,8 +53,10 @@ __all__ = [
     "load_demonstrations",
     "load_mdp",
     "load_policy",
+    "load_similarity",
     "make_environment",
     "save_demonstrations",
     "save_mdp",
     "save_policy",
+    "save_similarity",
 ]

@@ -16,6 +16,7 @@
                     final_states      integers [M], optional: the state after the last step; -1: unknown
     policy          policy            [S, A], rows sum to 1
                     and whatever else its maker put there
+    similarities    see `save_similarity`
     each            format_version    1, optional
 
 Anything that `numpy.savez` wrote with these names is read. What is read goes through the same checks as fresh input;
@@ -67,7 +68,7 @@ def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None =
       >>> load_mdp(path).num_states
       2
     """
-    arrays = _read(path)
+    arrays = read_archive(path)
     options = {name: arrays[name] for name in ("initial", "features", "allowed") if name in arrays}
     if discount is not None:
         if "discount" in arrays:
@@ -102,7 +103,7 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
       >>> load_demonstrations(path).mask.tolist()
       [[True, True, False], [True, True, True]]
     """
-    arrays = _read(path)
+    arrays = read_archive(path)
     _require(path, arrays, "states", "actions")
     try:
         states, actions = np.atleast_2d(arrays["states"]), np.atleast_2d(arrays["actions"])
@@ -141,7 +142,7 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
       >>> load_arrays(path, "reward", "terminal")
       {'reward': array([0., 1.])}
     """
-    arrays = _read(path)
+    arrays = read_archive(path)
     return {name: arrays[name] for name in names if name in arrays}
 
 
@@ -160,7 +161,7 @@ def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
       >>> load_policy(path).tolist()
       [[0.5, 0.5], [1.0, 0.0]]
     """
-    arrays = _read(path)
+    arrays = read_archive(path)
     _require(path, arrays, "policy")
     try:
         return _validated_policy(arrays["policy"])
@@ -185,7 +186,7 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
     """
     layout = {"transition": np.asarray(mdp.probability)} if mdp.is_dense else _fields(mdp, "next_state", "probability")
     allowed = _fields(mdp, "allowed") if mdp.restricts_actions else {}
-    _write(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed})
+    write_archive(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed})
 
 
 def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations) -> None:
@@ -212,7 +213,7 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     )
     answers = _fields(demonstrations, "is_answer") if np.asarray(demonstrations.is_answer).any() else {}
     fields = _fields(demonstrations, "states", "actions", "terminated", "final_states")
-    _write(path, {**fields, **answers, "length": length})
+    write_archive(path, {**fields, **answers, "length": length})
 
 
 def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extras: Shaped[ArrayLike, "..."]) -> None:
@@ -238,7 +239,7 @@ def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extr
             raise ValueError(f"an array of a policy's file cannot be called {name!r}")
         if array.dtype.hasobject:
             raise ValueError(f"{name} must be a plain array, got dtype {array.dtype}")
-    _write(path, {"policy": checked, **arrays})
+    write_archive(path, {"policy": checked, **arrays})
 
 
 def _validated_policy(policy: np.ndarray) -> np.ndarray:
@@ -270,14 +271,19 @@ def whole_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
         raise
 
 
-def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
+def write_archive(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *, is_compressed: bool = True) -> None:
+    """Writes arrays by name; a million random numbers take a second longer if compressed, and are hardly smaller.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
     with whole_file(path) as file:
         named: dict[str, Any] = {"format_version": FORMAT_VERSION, **arrays}
-        np.savez_compressed(file, **named)
+        (np.savez_compressed if is_compressed else np.savez)(file, **named)
 
 
-def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """All arrays of an archive."""
+def read_archive(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All arrays of an archive, by name; `FileError` where there is none."""
     try:
         with open(path, "rb") as file:
             archive = np.load(file, allow_pickle=False)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
+from tqdm import tqdm
 
 from jaxhom import checks
 from jaxhom.models.graph import host_graph
@@ -31,10 +32,13 @@ from jaxhom.similarity.decisions import (
     is_similar,
     require_decided,
 )
+from jaxhom.similarity.lax_pairs import LaxPairs
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
+from jaxhom.similarity.pair_blocks import pair_blocks
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys, pair_set
 from jaxhom.similarity.relations import UserRelation, pair_errors
+from jaxhom.similarity.table_contents import heading, options_in
 from jaxhom.solvers.lane_queue import is_settled
 
 if TYPE_CHECKING:
@@ -91,7 +95,8 @@ class SimilarityTable:
 
     The table grows by what it is asked; it belongs to the host and is no pytree. Threads may share it. It takes
     concrete values alone, inside jit, vmap and grad too. Completed, it answers for traced demonstrations: see
-    `complete`.
+    `complete`. What was solved stays when a call is interrupted: asked again, the table goes on from there.
+    `interop.save_similarity` and `interop.load_similarity` keep it in a file.
 
     Example:
       >>> import jaxhom
@@ -131,6 +136,48 @@ class SimilarityTable:
         self._known = PairBounds(self.mdp.dtype)
         self._lock = threading.RLock()
         self._maps: dict[tuple[int, int], tuple[np.ndarray, LocalSimilarity]] = {}
+
+    @_one_at_a_time
+    def contents(self) -> dict[str, np.ndarray]:
+        """All that is known of the errors, by name, as plain arrays: `restored` makes a table of them.
+
+        Maps and models are not among them.
+
+        Raises:
+          ValueError: if the relation is a function.
+        """
+        about = heading(self.mdp, self.given_relation, self.distance, self.anchored, self.labels)
+        renamings = self._pairs.contents() if isinstance(self._pairs, LaxPairs) else {}
+        return {**about, **self._book.contents(), **self._known.contents(), **renamings}
+
+    @classmethod
+    @checks.eager_where_concrete
+    def restored(cls, mdp: MDP, contents: Mapping[str, np.ndarray]) -> SimilarityTable:
+        """A table that knows what another one did, whose `contents` these are; it solves none of it again.
+
+        Args:
+          mdp: the model that it was made for: its transitions, allowed actions and number type.
+          contents: arrays by name.
+
+        Raises:
+          ValueError: if they are a table's for another model, or no table's.
+
+        Example:
+          >>> import jaxhom
+          >>> grid = jaxhom.gridworld(4)
+          >>> table = jaxhom.SimilarityTable(grid).complete(threshold=0.2)
+          >>> again = jaxhom.SimilarityTable.restored(grid, table.contents())
+          >>> again.complete(threshold=0.2).num_solved
+          0
+        """
+        model = as_model(mdp)
+        require_concrete(model)
+        table = cls(model, **options_in(contents, model))
+        table._book.restore(contents)
+        table._known.restore(contents, table.num_classes)
+        if isinstance(table._pairs, LaxPairs):
+            table._pairs.restore(contents, table.num_classes)
+        return table
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "_lock"}
@@ -408,8 +455,11 @@ class SimilarityTable:
     def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool) -> None:
         """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before."""
         pairs = pairs[self._is_to_solve(pairs, goal)]
-        if len(pairs):
-            self._known.add(pairs, self._pairs.brackets(pairs, goal, progress=progress), goal)
+        if not len(pairs):
+            return
+        with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
+            for block in pair_blocks(pairs, self._book.size, goal):
+                self._known.add(block, self._pairs.brackets(block, goal, bar.update), goal)
 
     def _is_to_solve(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
         """bool [Q]: whether pairs of classes are open, and were not tried before."""

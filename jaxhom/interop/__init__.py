@@ -7,11 +7,13 @@
   Minari, arrays and CSV files, with a report of what was dropped; `answers_from_csv`: answers about single states.
 * `save_*`, `load_*`: models, demonstrations and policies in `.npz` files, and whatever else is in these.
 * `save_similarity`, `load_similarity`: what a table of similarities has solved, for a later process to go on from.
+* `save_all_brackets`, `load_all_brackets`: those of all pairs, in a folder, for several processes and in turns.
 
 Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` itself. No other library is imported
 before it is needed.
 """
 
+from jaxhom.interop.all_brackets import AllBrackets, load_all_brackets, save_all_brackets
 from jaxhom.interop.csv_steps import answers_from_csv, demonstrations_from_csv
 from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
@@ -36,6 +38,7 @@ from jaxhom.interop.trajectories import (
 )
 
 __all__ = [
+    "AllBrackets",
     "FileError",
     "GymnasiumModel",
     "ImportReport",
@@ -49,12 +52,14 @@ __all__ = [
     "from_mdptoolbox",
     "from_samples",
     "from_scipy",
+    "load_all_brackets",
     "load_arrays",
     "load_demonstrations",
     "load_mdp",
     "load_policy",
     "load_similarity",
     "make_environment",
+    "save_all_brackets",
     "save_demonstrations",
     "save_mdp",
     "save_policy",

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -74,13 +75,13 @@ def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None =
         if "discount" in arrays:
             raise FileError(f"{path}: it has a discount of its own, {checks.in_one_line(arrays['discount'].tolist())}")
         arrays["discount"] = np.asarray(discount)
-    _require(path, arrays, "discount")
+    require_arrays(path, arrays, "discount")
     try:
         if "transition" in arrays:
             return MDP.from_dense(arrays["transition"], discount=arrays["discount"], **options)
         if "next_state" not in arrays and "probability" not in arrays:
             raise ValueError("neither transition nor next_state and probability are in it")
-        _require(path, arrays, "next_state", "probability")
+        require_arrays(path, arrays, "next_state", "probability")
         return MDP.from_successors(arrays["next_state"], arrays["probability"], discount=arrays["discount"], **options)
     except FileError:
         raise
@@ -104,7 +105,7 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
       [[True, True, False], [True, True, True]]
     """
     arrays = read_archive(path)
-    _require(path, arrays, "states", "actions")
+    require_arrays(path, arrays, "states", "actions")
     try:
         states, actions = np.atleast_2d(arrays["states"]), np.atleast_2d(arrays["actions"])
         checks.require_shape("states", states, "[M, H]", states.ndim == 2)
@@ -162,7 +163,7 @@ def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
       [[0.5, 0.5], [1.0, 0.0]]
     """
     arrays = read_archive(path)
-    _require(path, arrays, "policy")
+    require_arrays(path, arrays, "policy")
     try:
         return _validated_policy(arrays["policy"])
     except ValueError as error:
@@ -258,7 +259,7 @@ def whole_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     Raises:
       OSError: if the file cannot be written.
     """
-    partial = f"{os.fspath(path)}.partial"
+    partial = f"{os.fspath(path)}.{secrets.token_hex(4)}.partial"  # others may be writing it too
     try:
         with open(partial, "wb") as file:
             yield file
@@ -311,7 +312,7 @@ def _require_version(path: str | os.PathLike, version: np.ndarray) -> None:
         raise FileError(f"{path}: written in format {version}, this release reads up to {FORMAT_VERSION}")
 
 
-def _require(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
+def require_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
     for name in names:
         if name not in arrays:
             present = ", ".join(sorted(arrays)) or "nothing"

@@ -25,7 +25,7 @@ def save_similarity(path: str | os.PathLike, table: SimilarityTable) -> None:
 
     Args:
       path: the file; what was there is replaced once all is written.
-      table: also one whose work was interrupted.
+      table: also one whose work was interrupted. Of one that processes share, let one of them write.
 
     Raises:
       ValueError: if the table's relation is a function.
@@ -43,12 +43,13 @@ def save_similarity(path: str | os.PathLike, table: SimilarityTable) -> None:
     write_archive(path, table.contents(), is_compressed=False)
 
 
-def load_similarity(path: str | os.PathLike, mdp: MDP) -> SimilarityTable:
+def load_similarity(path: str | os.PathLike, mdp: MDP, *, across_processes: bool = False) -> SimilarityTable:
     """Reads a table that `save_similarity` wrote; it solves nothing again, and decides as the other did.
 
     Args:
       path: the file.
       mdp: the model that the table was made for; rewards, features and discount do not matter.
+      across_processes: as in `SimilarityTable`; all processes have to read the same.
 
     Raises:
       FileError: if the file is missing, damaged, of another kind or of another model.
@@ -59,7 +60,7 @@ def load_similarity(path: str | os.PathLike, mdp: MDP) -> SimilarityTable:
     """
     model = as_model(mdp)
     try:
-        return SimilarityTable.restored(model, read_archive(path))
+        return SimilarityTable.restored(model, read_archive(path), across_processes=across_processes)
     except FileError:
         raise
     except ValueError as error:

@@ -7,6 +7,7 @@ same table, and bounds that were found for one threshold serve every other.
 from __future__ import annotations
 
 import functools
+import hashlib
 import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,7 +20,7 @@ from jaxhom import checks
 from jaxhom.models.graph import host_graph
 from jaxhom.models.inputs import as_model, check_labels, check_states
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom.similarity.brackets import Goal, LocalSimilarity, Progress
 from jaxhom.similarity.class_pairs import ClassModels
 from jaxhom.similarity.classes import ClassBook
 from jaxhom.similarity.decisions import (
@@ -37,8 +38,9 @@ from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
 from jaxhom.similarity.pair_blocks import pair_blocks
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys, pair_set
+from jaxhom.similarity.process_shares import solved_in_shares
 from jaxhom.similarity.relations import UserRelation, pair_errors
-from jaxhom.similarity.table_contents import heading, options_in
+from jaxhom.similarity.table_contents import heading, options_in, transitions_digest
 from jaxhom.solvers.lane_queue import is_settled
 
 if TYPE_CHECKING:
@@ -83,12 +85,14 @@ class SimilarityTable:
           (Taylor et al. 2008). Votes are renamed back by the permutation.
         * a function of two local models, source and target, with `.states`, `.transition` [n, A, n] and `.labels`
           [n, A, L] or None in NumPy: it returns whether they are similar, an error of at least 0, or bounds on one.
+      across_processes: share the work out to all processes of `jax.distributed`. All of them have to ask their tables
+        the same, in the same order, and all get the whole answer. An error or Ctrl-C in one ends the call in all.
 
     Attributes:
-      mdp, distance, anchored: as given.
+      mdp, distance, anchored, across_processes: as given.
       labels: [S, A, L], weighted; None if none were given.
       compares: the relation as given; its name if it is a function.
-      num_solved: how many programs have been solved, each for a pair of classes.
+      num_solved: how many programs have been solved, each for a pair of classes; by this process.
 
     Raises:
       ValueError: if the model is traced, an option out of range, or labels do not fit.
@@ -121,6 +125,7 @@ class SimilarityTable:
         labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
         label_weight: float = 1.0,
         relation: str | UserRelation = "homomorphism",
+        across_processes: bool = False,
     ):
         self.mdp = as_model(mdp)
         require_concrete(self.mdp)
@@ -129,7 +134,9 @@ class SimilarityTable:
         self.labels = None if labels is None else check_labels(self.mdp, labels, label_weight)
         if labels is None and checks.require_number("label_weight", label_weight) != 1.0:
             raise ValueError(f"label_weight is {checks.in_one_line(label_weight)}, and there are no labels")
-        self.given_relation = relation
+        self.given_relation, self.across_processes = relation, bool(across_processes)
+        if across_processes and self.renames:
+            raise ValueError('relation="lax" is not shared by processes: give each a table of its own')
         self._maker = LocalModelMaker(host_graph(self.mdp), self.distance, self.labels)
         self._book = ClassBook(self._maker)
         self._pairs = pair_errors(relation, ClassModels(self._maker, self._book), self.anchored)
@@ -146,18 +153,21 @@ class SimilarityTable:
         Raises:
           ValueError: if the relation is a function.
         """
-        about = heading(self.mdp, self.given_relation, self.distance, self.anchored, self.labels)
         renamings = self._pairs.contents() if isinstance(self._pairs, LaxPairs) else {}
+        about = heading(self.mdp, self.given_relation, self.distance, self.anchored, self.labels)
         return {**about, **self._book.contents(), **self._known.contents(), **renamings}
 
     @classmethod
     @checks.eager_where_concrete
-    def restored(cls, mdp: MDP, contents: Mapping[str, np.ndarray]) -> SimilarityTable:
+    def restored(
+        cls, mdp: MDP, contents: Mapping[str, np.ndarray], *, across_processes: bool = False
+    ) -> SimilarityTable:
         """A table that knows what another one did, whose `contents` these are; it solves none of it again.
 
         Args:
           mdp: the model that it was made for: its transitions, allowed actions and number type.
           contents: arrays by name.
+          across_processes: as in `SimilarityTable`; all processes have to come with the same contents.
 
         Raises:
           ValueError: if they are a table's for another model, or no table's.
@@ -172,7 +182,7 @@ class SimilarityTable:
         """
         model = as_model(mdp)
         require_concrete(model)
-        table = cls(model, **options_in(contents, model))
+        table = cls(model, **options_in(contents, model), across_processes=across_processes)
         table._book.restore(contents)
         table._known.restore(contents, table.num_classes)
         if isinstance(table._pairs, LaxPairs):
@@ -242,16 +252,18 @@ class SimilarityTable:
         method: str = "auto",
         max_iterations: int = 100_000,
         progress: bool = False,
+        keep: bool = True,
     ) -> LocalSimilarity:
         """Brackets the optimal error e of LP (9) for pairs of states, from M^{s,d} to M^{s',d}.
 
         Arguments, result and errors are those of `local_similarity`. Only pairs of classes whose bounds are not yet
-        that close are solved.
+        that close are solved. With keep=False the table does not grow, for more pairs than memory holds.
         """
         goal = Goal.checked(tolerance=tolerance, method=method, max_iterations=max_iterations)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
-        self._settle(pairs, goal, progress)
-        return jax.tree.map(lambda leaf: leaf[where], self._widened(pairs, goal))
+        known = self._known if keep else self._known.part(pairs)
+        self._settle(pairs, goal, progress, known)
+        return jax.tree.map(lambda leaf: leaf[where], self._widened(pairs, goal, known))
 
     @checks.eager_where_concrete
     @_one_at_a_time
@@ -452,21 +464,44 @@ class SimilarityTable:
         pairs = self._known.pairs()
         return pairs, self._known.look_up(pairs)
 
-    def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool) -> None:
-        """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before."""
-        pairs = pairs[self._is_to_solve(pairs, goal)]
+    def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool, known: PairBounds | None = None) -> None:
+        """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before.
+
+        What is found goes where it is `known`, the table if None, block by block.
+        """
+        known = self._known if known is None else known
+        pairs = pairs[self._is_to_solve(pairs, goal, known)]
         if not len(pairs):
             return
+        solve = self._in_shares if self.across_processes else self._pairs.brackets
+        shares = jax.process_count() if self.across_processes else 1
         with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
-            for block in pair_blocks(pairs, self._book.size, goal):
-                self._known.add(block, self._pairs.brackets(block, goal, bar.update), goal)
+            for block in pair_blocks(pairs, self._book.size, goal, shares):
+                known.add(block, solve(block, goal, bar.update), goal)
 
-    def _is_to_solve(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
+    def _in_shares(self, pairs: np.ndarray, goal: Goal, progress: Progress) -> LocalSimilarity:
+        """As the relation's `brackets`, of which this process solves a share."""
+
+        def solve(own: np.ndarray) -> LocalSimilarity:
+            progress(len(pairs) - len(own))
+            return self._pairs.brackets(own, goal, progress)
+
+        states = self._book.representative[pairs].tobytes()
+        return solved_in_shares(solve, pairs, self._identity + states + repr(goal).encode())
+
+    @functools.cached_property
+    def _identity(self) -> bytes:
+        """By which tables of different processes are told apart."""
+        labels = b"" if self.labels is None else self.labels.tobytes()
+        options = repr((self.compares, self.distance, self.anchored)).encode()
+        return transitions_digest(self.mdp).tobytes() + hashlib.sha256(labels).digest() + options
+
+    def _is_to_solve(self, pairs: np.ndarray, goal: Goal, known: PairBounds | None = None) -> np.ndarray:
         """bool [Q]: whether pairs of classes are open, and were not tried before."""
-        known = self._known.look_up(pairs)
-        tolerance = self._pairs.tolerance(goal, self._pairs.slack(pairs))
-        is_open = ~is_settled(known.lower, known.upper, tolerance, goal.threshold)
-        return is_open & ~self._known.was_tried(pairs, goal)
+        known = self._known if known is None else known
+        bounds, tolerance = known.look_up(pairs), self._pairs.tolerance(goal, self._pairs.slack(pairs))
+        is_open = ~is_settled(bounds.lower, bounds.upper, tolerance, goal.threshold)
+        return is_open & ~known.was_tried(pairs, goal)
 
     def _decided(self, pairs: np.ndarray, goal: Goal, mutual: bool) -> Decisions:
         """What is known of pairs of classes [Q, 2], in both directions if `mutual`."""
@@ -477,11 +512,11 @@ class SimilarityTable:
         """[Q]: upper bounds on the errors of pairs of classes [Q, 2]; the largest of those of each pair's ways."""
         return np.maximum.reduce([self._widened(way, Goal(tolerance)).upper for way in ways])
 
-    def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
+    def _widened(self, pairs: np.ndarray, goal: Goal, known: PairBounds | None = None) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""
-        known, slack = self._known.look_up(pairs), self._pairs.slack(pairs)
-        lower, upper = np.maximum(known.lower - slack, 0), known.upper + slack
-        return known.replace(lower=lower, upper=upper, status=honest_status(goal.is_met(lower, upper), known.status))
+        bounds, slack = (self._known if known is None else known).look_up(pairs), self._pairs.slack(pairs)
+        lower, upper = np.maximum(bounds.lower - slack, 0), bounds.upper + slack
+        return bounds.replace(lower=lower, upper=upper, status=honest_status(goal.is_met(lower, upper), bounds.status))
 
     def _pairs_of(self, sources: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The different pairs of classes [Q, 2] of pairs of states, and which of them each is, [P]."""

@@ -16,11 +16,10 @@ if TYPE_CHECKING:
 
     from jaxhom.models.mdp import MDP
 
+HEADING = ("transitions", "relation", "distance", "anchored", "labels")
+"""What a table is about, labels only where there are any."""
 _NAMES = (
-    "transitions",
-    "relation",
-    "distance",
-    "anchored",
+    *HEADING[:-1],
     "class_of_state",
     "representative",
     "class_key",
@@ -43,8 +42,9 @@ def heading(
     """
     if callable(relation):
         raise ValueError("the relation is a function, which cannot be written down: only relations with a name can")
-    kind = {"relation": np.array(relation), "distance": np.array(distance), "anchored": np.array(anchored)}
-    return {"transitions": transitions_digest(mdp), **kind, **({} if labels is None else {"labels": labels})}
+    values = {"relation": relation, "distance": distance, "anchored": anchored, "labels": labels}
+    named = {name: np.asarray(value) for name, value in values.items() if value is not None}
+    return {"transitions": transitions_digest(mdp), **named}
 
 
 def options_in(contents: Mapping[str, np.ndarray], mdp: MDP) -> dict[str, Any]:

@@ -7,20 +7,18 @@ same table, and bounds that were found for one threshold serve every other.
 from __future__ import annotations
 
 import functools
-import hashlib
 import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from jaxhom import checks
 from jaxhom.models.graph import host_graph
 from jaxhom.models.inputs import as_model, check_labels, check_states
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity.brackets import Goal, LocalSimilarity, Progress
+from jaxhom.similarity.brackets import Goal, LocalSimilarity
 from jaxhom.similarity.class_pairs import ClassModels
 from jaxhom.similarity.classes import ClassBook
 from jaxhom.similarity.decisions import (
@@ -36,12 +34,10 @@ from jaxhom.similarity.decisions import (
 from jaxhom.similarity.lax_pairs import LaxPairs
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
-from jaxhom.similarity.pair_blocks import pair_blocks
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys, pair_set
-from jaxhom.similarity.process_shares import solved_in_shares
 from jaxhom.similarity.relations import UserRelation, pair_errors
-from jaxhom.similarity.table_contents import heading, options_in, transitions_digest
-from jaxhom.solvers.lane_queue import is_settled
+from jaxhom.similarity.settling import Settling
+from jaxhom.similarity.table_contents import heading, identity, options_in
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Int, Num
@@ -141,6 +137,8 @@ class SimilarityTable:
         self._book = ClassBook(self._maker)
         self._pairs = pair_errors(relation, ClassModels(self._maker, self._book), self.anchored)
         self._known = PairBounds(self.mdp.dtype)
+        about = (self.mdp, self.compares, self.distance, self.anchored, self.labels)
+        self._settling = Settling(self._pairs, self._book, identity(*about) if self.across_processes else None)
         self._lock = threading.RLock()
         self._maps: dict[tuple[int, int], tuple[np.ndarray, LocalSimilarity]] = {}
 
@@ -262,8 +260,8 @@ class SimilarityTable:
         goal = Goal.checked(tolerance=tolerance, method=method, max_iterations=max_iterations)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
         known = self._known if keep else self._known.part(pairs)
-        self._settle(pairs, goal, progress, known)
-        return jax.tree.map(lambda leaf: leaf[where], self._widened(pairs, goal, known))
+        self._settling.settle(pairs, goal, known, progress=progress)
+        return jax.tree.map(lambda leaf: leaf[where], self._settling.widened(pairs, goal, known))
 
     @checks.eager_where_concrete
     @_one_at_a_time
@@ -464,44 +462,13 @@ class SimilarityTable:
         pairs = self._known.pairs()
         return pairs, self._known.look_up(pairs)
 
-    def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool, known: PairBounds | None = None) -> None:
-        """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before.
+    def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool) -> None:
+        """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before."""
+        self._settling.settle(pairs, goal, self._known, progress=progress)
 
-        What is found goes where it is `known`, the table if None, block by block.
-        """
-        known = self._known if known is None else known
-        pairs = pairs[self._is_to_solve(pairs, goal, known)]
-        if not len(pairs):
-            return
-        solve = self._in_shares if self.across_processes else self._pairs.brackets
-        shares = jax.process_count() if self.across_processes else 1
-        with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
-            for block in pair_blocks(pairs, self._book.size, goal, shares):
-                known.add(block, solve(block, goal, bar.update), goal)
-
-    def _in_shares(self, pairs: np.ndarray, goal: Goal, progress: Progress) -> LocalSimilarity:
-        """As the relation's `brackets`, of which this process solves a share."""
-
-        def solve(own: np.ndarray) -> LocalSimilarity:
-            progress(len(pairs) - len(own))
-            return self._pairs.brackets(own, goal, progress)
-
-        states = self._book.representative[pairs].tobytes()
-        return solved_in_shares(solve, pairs, self._identity + states + repr(goal).encode())
-
-    @functools.cached_property
-    def _identity(self) -> bytes:
-        """By which tables of different processes are told apart."""
-        labels = b"" if self.labels is None else self.labels.tobytes()
-        options = repr((self.compares, self.distance, self.anchored)).encode()
-        return transitions_digest(self.mdp).tobytes() + hashlib.sha256(labels).digest() + options
-
-    def _is_to_solve(self, pairs: np.ndarray, goal: Goal, known: PairBounds | None = None) -> np.ndarray:
+    def _is_to_solve(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
         """bool [Q]: whether pairs of classes are open, and were not tried before."""
-        known = self._known if known is None else known
-        bounds, tolerance = known.look_up(pairs), self._pairs.tolerance(goal, self._pairs.slack(pairs))
-        is_open = ~is_settled(bounds.lower, bounds.upper, tolerance, goal.threshold)
-        return is_open & ~known.was_tried(pairs, goal)
+        return self._settling.is_to_solve(pairs, goal, self._known)
 
     def _decided(self, pairs: np.ndarray, goal: Goal, mutual: bool) -> Decisions:
         """What is known of pairs of classes [Q, 2], in both directions if `mutual`."""
@@ -512,11 +479,9 @@ class SimilarityTable:
         """[Q]: upper bounds on the errors of pairs of classes [Q, 2]; the largest of those of each pair's ways."""
         return np.maximum.reduce([self._widened(way, Goal(tolerance)).upper for way in ways])
 
-    def _widened(self, pairs: np.ndarray, goal: Goal, known: PairBounds | None = None) -> LocalSimilarity:
+    def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""
-        bounds, slack = (self._known if known is None else known).look_up(pairs), self._pairs.slack(pairs)
-        lower, upper = np.maximum(bounds.lower - slack, 0), bounds.upper + slack
-        return bounds.replace(lower=lower, upper=upper, status=honest_status(goal.is_met(lower, upper), bounds.status))
+        return self._settling.widened(pairs, goal, self._known)
 
     def _pairs_of(self, sources: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The different pairs of classes [Q, 2] of pairs of states, and which of them each is, [P]."""

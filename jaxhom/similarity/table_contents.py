@@ -67,6 +67,13 @@ def options_in(contents: Mapping[str, np.ndarray], mdp: MDP) -> dict[str, Any]:
     }
 
 
+def identity(mdp: MDP, relation: str, distance: int, anchored: bool, labels: Num[np.ndarray, "S A L"] | None) -> bytes:
+    """A digest of all that errors depend on, by which the tables of different processes are told apart."""
+    digest = hashlib.sha256(repr((relation, distance, anchored)).encode() + transitions_digest(mdp).tobytes())
+    digest.update(b"" if labels is None else np.ascontiguousarray(labels))
+    return digest.digest()
+
+
 def transitions_digest(mdp: MDP) -> UInt8[np.ndarray, " 32"]:
     """A digest of all that local models are made of; the same on every machine."""
     digest = hashlib.sha256()

@@ -434,17 +434,19 @@ class SimilarityTable:
         sources, targets = self._validated_pairs(sources, targets)
         pairs, where = self._pairs_of(sources, targets)
         goal = Goal(tolerance=_MAP_TOLERANCE[np.dtype(self.mdp.dtype).name], method="pdhg")
+        # One process may explain alone: tables that processes share stay the same.
+        known = self._known.part(pairs) if self.across_processes else self._known
         for pair in pairs:
             key = tuple(pair.tolist())
             if key not in self._maps:
                 found, f = self._pairs.map_of(pair, goal)
-                self._known.add(pair[None], found)
                 self._maps[key] = f, found
+            known.add(pair[None], self._maps[key][1])
         # The upper bound is that of the map, which a better one that is known need not prove.
         own = [self._maps[tuple(pair)] for pair in pairs.tolist()]
         upper = np.array([found.upper[0] for _, found in own], self.mdp.dtype) + self._pairs.slack(pairs)
-        known = self._widened(pairs, goal).replace(upper=upper)
-        bounds = known.replace(status=honest_status(goal.is_met(known.lower, upper), known.status))
+        bounds = self._settling.widened(pairs, goal, known).replace(upper=upper)
+        bounds = bounds.replace(status=honest_status(goal.is_met(bounds.lower, upper), bounds.status))
         return carry_maps(
             self._maker,
             (sources, targets),

@@ -18,7 +18,7 @@
                     final_states      integers [M], optional: the state after the last step; -1: unknown
     policy          policy            [S, A], rows sum to 1
                     and whatever else its maker put there
-    similarities    see `save_similarity`
+    similarities    what `save_similarity` and `--table` of the command line write
     each            format_version    1, optional
 
 Anything that `numpy.savez` wrote with these names is read. What is read goes through the same checks as fresh input;

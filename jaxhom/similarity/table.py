@@ -255,7 +255,7 @@ class SimilarityTable:
         """Brackets the optimal error e of LP (9) for pairs of states, from M^{s,d} to M^{s',d}.
 
         Arguments, result and errors are those of `local_similarity`. Only pairs of classes whose bounds are not yet
-        that close are solved. With keep=False the table does not grow, for more pairs than memory holds.
+        that close are solved. With keep=False their bounds are not kept, for more pairs than memory holds.
         """
         goal = Goal.checked(tolerance=tolerance, method=method, max_iterations=max_iterations)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))

@@ -7,6 +7,7 @@ states that a policy is wanted for, and its own options; it returns a generaliza
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom.cli.options import Parser, positive
+from jaxhom.cli.table_files import kept_table
 from jaxhom.generalization.algorithm1 import soft_local_homomorphism
 from jaxhom.generalization.choice import choose_generalization
 from jaxhom.generalization.neighbors import nearest_neighbors
@@ -36,16 +38,17 @@ if TYPE_CHECKING:
 Found = tuple[Generalization, dict[str, Any]]
 
 
-def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, **settings) -> Found:
+def _local(problem, demonstrations, progress, states, *, printed=False, mutual=False, table=None, **settings) -> Found:
     if problem.terminal is not None:  # no action matters there, and their local models can be large
         states = ~problem.terminal if states is None else states & ~problem.terminal
     if "labels" in settings:
         settings["labels"] = problem.labels(settings["labels"])
     compared = {name: settings[name] for name in ("labels", "label_weight", "relation") if name in settings}
-    table = problem.similarity(settings.get("distance", 1), anchored=not printed, **compared)
-    options = {**settings, "anchored": not printed, "mutual": mutual, "table": table, "progress": progress}
-    found = soft_local_homomorphism(problem.mdp, demonstrations, states=states, **options)
-    return found, {"classes_of_local_models": table.num_classes, "pairs_of_classes_solved": table.num_solved}
+    known = problem.similarity(settings.get("distance", 1), anchored=not printed, file=table, **compared)
+    options = {**settings, "anchored": not printed, "mutual": mutual, "table": known, "progress": progress}
+    with contextlib.nullcontext() if table is None else kept_table(table, known):
+        found = soft_local_homomorphism(problem.mdp, demonstrations, states=states, **options)
+    return found, {"classes_of_local_models": known.num_classes, "pairs_of_classes_solved": known.num_solved}
 
 
 def _choose(problem, demonstrations, progress, _, **settings) -> Found:
@@ -99,7 +102,7 @@ METHODS = {
     "soft-local-homomorphism": Method(
         "soft local homomorphism",
         _local,
-        ("distance", "threshold", "mutual", "printed", "tolerance", *_COMPARED, "relation", *_VOTES),
+        ("distance", "threshold", "mutual", "printed", "tolerance", *_COMPARED, "relation", *_VOTES, "table"),
     ),
     "choose": Method("generalization chosen by the data", _choose, ("distance", *_COMPARED)),
     "soft-homomorphism": Method(
@@ -138,6 +141,11 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     },
     "weights": {"choices": WEIGHTS, "help": "of votes (default equal)"},
     "temperature": {"type": float, "metavar": "T", "help": "of weights by similarity (default 0.05)"},
+    "table": {
+        "metavar": "FILE",
+        "help": "where to keep what is solved about pairs of local models (.npz): read if it is there, written at the "
+        "end and at Ctrl-C",
+    },
     "max_iterations": {"type": positive, "metavar": "N", "help": "of the global program (default 20000)"},
     "metric": {
         "choices": ("hops", "euclidean"),

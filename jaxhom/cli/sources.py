@@ -20,6 +20,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.cli.options import environment_options
+from jaxhom.cli.table_files import open_table
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.domains.track_maps import SHIPPED
@@ -80,14 +81,16 @@ class Problem:
             raise ValueError(f"{self.name} has no reward (array 'reward')")
         return optimal_policy(self.mdp, self.reward)
 
-    def similarity(self, distance: int = 1, *, anchored: bool = True, **compared: Any) -> SimilarityTable:
+    def similarity(
+        self, distance: int = 1, *, anchored: bool = True, file: str | None = None, **compared: Any
+    ) -> SimilarityTable:
         """The table of the model's local models, one for all sets of demonstrations: no pair is solved again.
 
-        What else is `compared`, labels and the relation, is the same in all calls.
+        What else is `compared`, labels and the relation, is the same in all calls; and so is the `file` that has it.
         """
         key = distance, anchored
         if key not in self._tables:
-            self._tables[key] = SimilarityTable(self.mdp, distance=distance, anchored=anchored, **compared)
+            self._tables[key] = open_table(file, self.mdp, distance=distance, anchored=anchored, **compared)
         return self._tables[key]
 
     @functools.cached_property

@@ -10,11 +10,14 @@
   `demonstrations_from_steps`, `demonstrations_from_transitions` (flat arrays) and `demonstrations_from_states` (states
   without actions). `answers_from_csv`: answers about single states.
 * `save_*`, `load_*`: models, demonstrations and policies in `.npz` files, and whatever else is in these.
+* `save_similarity`, `load_similarity`: what a table of similarities has solved, for a later process to go on from.
+* `save_all_brackets`, `load_all_brackets`: those of all pairs, in a folder, for several processes and in turns.
 
 Maps of racetracks, `.track` files among them, are read by `jaxhom.racetrack` itself. No other library is imported
 before it is needed.
 """
 
+from jaxhom.interop.all_brackets import AllBrackets, load_all_brackets, save_all_brackets
 from jaxhom.interop.cassandra import from_cassandra
 from jaxhom.interop.csv_answers import answers_from_csv
 from jaxhom.interop.csv_steps import demonstrations_from_csv
@@ -40,12 +43,14 @@ from jaxhom.interop.networks import from_edges, from_networkx
 from jaxhom.interop.octile import from_octile
 from jaxhom.interop.prism import from_prism
 from jaxhom.interop.samples import SampledModel, from_samples
+from jaxhom.interop.similarity_files import load_similarity, save_similarity
 from jaxhom.interop.state_sequences import demonstrations_from_states
 from jaxhom.interop.tables import from_table
 from jaxhom.interop.trajectories import demonstrations_from_episodes
 from jaxhom.interop.trajectory_sources import demonstrations_from
 
 __all__ = [
+    "AllBrackets",
     "FileError",
     "GymnasiumModel",
     "ImportReport",
@@ -69,13 +74,17 @@ __all__ = [
     "from_samples",
     "from_scipy",
     "from_table",
+    "load_all_brackets",
     "load_arrays",
     "load_demonstrations",
     "load_mdp",
     "load_policy",
+    "load_similarity",
     "make_environment",
     "read_model",
+    "save_all_brackets",
     "save_demonstrations",
     "save_mdp",
     "save_policy",
+    "save_similarity",
 ]

@@ -18,6 +18,7 @@
                     final_states      integers [M], optional: the state after the last step; -1: unknown
     policy          policy            [S, A], rows sum to 1
                     and whatever else its maker put there
+    similarities    what `save_similarity` and `--table` of the command line write
     each            format_version    1, optional
 
 Anything that `numpy.savez` wrote with these names is read. What is read goes through the same checks as fresh input;
@@ -28,6 +29,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -71,20 +73,20 @@ def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None =
       >>> load_mdp(path).num_states
       2
     """
-    arrays = _read(path)
+    arrays = read_archive(path)
     options: dict[str, Any] = {name: arrays[name] for name in ("initial", "features", "allowed") if name in arrays}
     if discount is not None:
         if "discount" in arrays:
             raise FileError(f"{path}: it has a discount of its own, {checks.in_one_line(arrays['discount'].tolist())}")
         arrays["discount"] = np.asarray(discount)
-    _require(path, arrays, "discount")
+    require_arrays(path, arrays, "discount")
     try:
         options |= {name: names_of(name, arrays[name]) for name in ("state_names", "action_names") if name in arrays}
         if "transition" in arrays:
             return MDP.from_dense(arrays["transition"], discount=arrays["discount"], **options)
         if "next_state" not in arrays and "probability" not in arrays:
             raise ValueError("neither transition nor next_state and probability are in it")
-        _require(path, arrays, "next_state", "probability")
+        require_arrays(path, arrays, "next_state", "probability")
         return MDP.from_successors(arrays["next_state"], arrays["probability"], discount=arrays["discount"], **options)
     except FileError:
         raise
@@ -107,8 +109,8 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
       >>> load_demonstrations(path).mask.tolist()
       [[True, True, False], [True, True, True]]
     """
-    arrays = _read(path)
-    _require(path, arrays, "states", "actions")
+    arrays = read_archive(path)
+    require_arrays(path, arrays, "states", "actions")
     try:
         states, actions = np.atleast_2d(arrays["states"]), np.atleast_2d(arrays["actions"])
         checks.require_shape("states", states, "[M, H]", states.ndim == 2)
@@ -149,7 +151,7 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
       >>> load_arrays(path, "reward", "terminal")
       {'reward': array([0., 1.])}
     """
-    return _read(path, names)
+    return read_archive(path, names)
 
 
 def names_of_arrays(path: str | os.PathLike) -> list[str]:
@@ -177,8 +179,8 @@ def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
       >>> load_policy(path).tolist()
       [[0.5, 0.5], [1.0, 0.0]]
     """
-    arrays = _read(path)
-    _require(path, arrays, "policy")
+    arrays = read_archive(path)
+    require_arrays(path, arrays, "policy")
     try:
         return _validated_policy(arrays["policy"])
     except ValueError as error:
@@ -205,7 +207,7 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
     layout = {"transition": np.asarray(mdp.probability)} if mdp.is_dense else _fields(mdp, "next_state", "probability")
     allowed = _fields(mdp, "allowed") if mdp.restricts_actions else {}
     names = {name: names_as_array(getattr(mdp, name)) for name in ("state_names", "action_names") if mdp[name]}
-    _write(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed, **names})
+    write_archive(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed, **names})
 
 
 def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations) -> None:
@@ -231,7 +233,7 @@ def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations)
     fields = _fields(demonstrations, "states", "terminated", "final_states")
     hidden = (np.arange(mask.shape[1]) < length[:, None]) & ~mask
     actions = np.where(hidden, -1, demonstrations.actions)
-    _write(path, {**fields, **answers, "actions": actions, "length": length})
+    write_archive(path, {**fields, **answers, "actions": actions, "length": length})
 
 
 def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extras: Shaped[ArrayLike, "..."]) -> None:
@@ -257,7 +259,7 @@ def save_policy(path: str | os.PathLike, policy: Float[ArrayLike, "S A"], **extr
             raise ValueError(f"an array of a policy's file cannot be called {name!r}")
         if array.dtype.hasobject:
             raise ValueError(f"{name} must be a plain array, got dtype {array.dtype}")
-    _write(path, {"policy": checked, **arrays})
+    write_archive(path, {"policy": checked, **arrays})
 
 
 def _validated_policy(policy: np.ndarray) -> np.ndarray:
@@ -276,7 +278,7 @@ def whole_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     Raises:
       OSError: if the file cannot be written.
     """
-    partial = f"{os.fspath(path)}.partial"
+    partial = f"{os.fspath(path)}.{secrets.token_hex(4)}.partial"  # others may be writing it too
     try:
         with open(partial, "wb") as file:
             yield file
@@ -289,14 +291,19 @@ def whole_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
         raise
 
 
-def _write(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
+def write_archive(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *, is_compressed: bool = True) -> None:
+    """Writes arrays by name; a million random numbers take a second longer if compressed, and are hardly smaller.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
     with whole_file(path) as file:
         named: dict[str, Any] = {"format_version": FORMAT_VERSION, **arrays}
-        np.savez_compressed(file, **named)
+        (np.savez_compressed if is_compressed else np.savez)(file, **named)
 
 
-def _read(path: str | os.PathLike, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """All arrays of an archive, or those of the given names that it holds."""
+def read_archive(path: str | os.PathLike, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """All arrays of an archive, or those of the given names that it holds; `FileError` where there is none."""
     arrays = {}
     with _archive(path) as archive:
         for name in archive.files:
@@ -344,7 +351,7 @@ def _require_version(path: str | os.PathLike, version: np.ndarray) -> None:
         raise FileError(f"{path}: written in format {version}, this release reads up to {FORMAT_VERSION}")
 
 
-def _require(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
+def require_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
     for name in names:
         if name not in arrays:
             present = ", ".join(sorted(arrays)) or "nothing"

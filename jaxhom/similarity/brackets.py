@@ -31,6 +31,8 @@ from jaxhom.solvers.lane_queue import is_settled, solve_many
 from jaxhom.status import Record, Status
 
 METHODS = ("auto", "pdhg", "interior_point")
+Progress = Callable[[int], object]
+"""Called with the number of pairs that just finished."""
 
 _MAX_LANES = 64  # of PDHG: they fill a CPU's vector units, and more wait for the slowest
 _BATCH_BYTES = 32 * 2**20  # of a batch of PDHG
@@ -45,6 +47,11 @@ NOISE = 32.0  # times eps: closer than that an iteration does not come
 _INTERIOR_BYTES = 2 * 2**20  # of a batch's normal matrices: a core's own cache
 _TIGHT = 1e-3  # wider gaps PDHG closes sooner
 _MAP_LANES = 8  # maps are asked for a few at a time
+
+
+def no_progress(count: int) -> None:
+    """Where nobody looks."""
+    del count
 
 
 class LocalSimilarity(Record):
@@ -128,7 +135,7 @@ def bracket_errors(
     pairs: np.ndarray | None = None,
     goal: Goal = Goal(),  # noqa: B008 (a tuple, it never changes)
     iterates: bool = True,
-    progress: Callable[[int], object] | None = None,
+    progress: Progress = no_progress,
 ) -> LocalSimilarity:
     """Brackets the optimal errors of LP (9) for P pairs of models given as arrays.
 
@@ -164,7 +171,6 @@ def bracket_errors(
     if goal.decides and anchored:
         result.lower[:] = lower_bounds_without_iterations(models)
     (waiting,) = np.nonzero(~(result.lower > goal.threshold))
-    progress = progress or _no_progress
     progress(len(result.lower) - len(waiting))
     if goal.decides and goal.method == "auto" and waiting.size:
         waiting = _decide_by_intervals(models, waiting, goal, result, progress)
@@ -189,7 +195,7 @@ def find_maps(
     """As `bracket_errors`, with its options, and the maps that prove the upper bounds: [P, n, m], zero on padding."""
     problem = ModelPairs.of(source, target, **options).problem(slice(None))
     if is_small_work(problem):
-        near = solve_on_host(problem, goal.tolerance, goal.threshold, _no_progress)
+        near = solve_on_host(problem, goal.tolerance, goal.threshold, no_progress)
         if goal.is_met(near.lower, near.upper).all():
             status = np.full(len(near.steps), Status.SOLVED, np.int32)
             return LocalSimilarity(lower=near.lower, upper=near.upper, iterations=near.steps, status=status), near.maps
@@ -252,7 +258,7 @@ def _settle_by_pdhg(
     problem: HomomorphismProblem,
     goal: Goal,
     lanes: int,
-    progress: Callable[[int], object] | None = None,
+    progress: Progress = no_progress,
     keep: tuple[str, ...] = (),
 ) -> tuple[LocalSimilarity, dict[str, np.ndarray]]:
     """Certified bounds of every lane, as close as asked for where the dtype allows it.
@@ -281,7 +287,7 @@ def _settle_by_pdhg(
         max_iterations=goal.max_iterations,
         lanes=lanes,
         keep=tuple({"lower", "upper", "steps", *points, *keep}),
-        progress=progress or _no_progress,
+        progress=progress,
     )
     lower, upper = np.fmax(found["lower"], 0.0), found["upper"]
     (rest,) = np.nonzero(~goal.is_met(lower, upper))
@@ -292,10 +298,6 @@ def _settle_by_pdhg(
     unsettled = np.where(found["steps"] < goal.max_iterations, Status.STALLED, Status.ITERATION_LIMIT)
     status = np.where(goal.is_met(lower, upper), Status.SOLVED, unsettled).astype(np.int32)
     return LocalSimilarity(lower=lower, upper=upper, iterations=found["steps"], status=status), found
-
-
-def _no_progress(count: int) -> None:
-    del count
 
 
 def _pdhg_lanes(problem) -> int:

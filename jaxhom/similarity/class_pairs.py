@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
-from jaxhom.similarity.brackets import Goal, LocalSimilarity, bracket_errors, find_maps
+from jaxhom.similarity.brackets import Goal, LocalSimilarity, Progress, bracket_errors, find_maps, no_progress
 from jaxhom.similarity.classes import ClassBook, model_rounding
 from jaxhom.similarity.local_models import LocalModelMaker, LocalModels, is_oversized
 from jaxhom.status import Record, Status
@@ -118,18 +117,17 @@ class ClassPairs:
         self.num_solved = 0
         self.most = 2.0 * models.label_size if models.has_labels else 1.0  # that any map can be off by
 
-    def brackets(self, pairs: np.ndarray, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+    def brackets(self, pairs: np.ndarray, goal: Goal, progress: Progress = no_progress) -> LocalSimilarity:
         """Bounds for different ordered pairs of classes [Q, 2]; a class against itself has an isomorphism."""
         groups = _Groups(pairs, self._models)
         result = self._without_programs(groups)
-        with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
-            bar.update(int((~groups.to_solve).sum()))
-            for members, widths in groups.members():
-                for index in self._models.chunks(members, widths):
-                    models = self._pair(pairs[index], widths)
-                    limited = self._limited(goal, widths, _MAX_PRODUCTS)
-                    found = bracket_errors(**models, goal=limited, iterates=self._iterates, progress=bar.update)
-                    jax.tree.map(lambda place, new, index=index: np.put(place, index, new), result, found)
+        progress(int((~groups.to_solve).sum()))
+        for members, widths in groups.members():
+            for index in self._models.chunks(members, widths):
+                models = self._pair(pairs[index], widths)
+                limited = self._limited(goal, widths, _MAX_PRODUCTS)
+                found = bracket_errors(**models, goal=limited, iterates=self._iterates, progress=progress)
+                jax.tree.map(lambda place, new, index=index: np.put(place, index, new), result, found)
         self.num_solved += int((result.iterations > 0).sum())
         return result
 

@@ -8,10 +8,11 @@ programs are solved for pairs of classes, never for pairs of states. Classes are
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.models.graph import host_graph
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.canonical_forms import canonical_forms
@@ -20,6 +21,7 @@ from jaxhom.status import Record
 
 _CHUNK_BYTES = 64 * 2**20  # of transition tensors at a time
 _CHUNK_ENTRIES = 2**22  # of transitions that make them
+_KEY_BYTES = 16
 
 
 class LocalModelClasses(Record):
@@ -39,6 +41,8 @@ class LocalModelClasses(Record):
 class ClassBook:
     """The classes of the states that have been met so far; a class once numbered keeps its number.
 
+    What it holds is true at every moment, whatever may interrupt it.
+
     Args:
       maker: builds the local models of some distance.
     """
@@ -47,21 +51,20 @@ class ClassBook:
         self._maker = maker
         self._label = np.full(maker.graph.num_states, -1, np.int32)
         self._class_of_key: dict[bytes, int] = {}
-        self._representative: list[int] = []
-        self._size: list[int] = []
+        self._classes: list[tuple[int, int]] = []  # the first state that was met, and the size of its model
 
     def __len__(self) -> int:
-        return len(self._size)
+        return len(self._classes)
 
     @property
     def representative(self) -> np.ndarray:
         """int32 [C], the first state that was met of each class."""
-        return np.array(self._representative, np.int32)
+        return np.array([state for state, _ in self._classes], np.int32)
 
     @property
     def size(self) -> np.ndarray:
         """int32 [C], the number of states of each class's model."""
-        return np.array(self._size, np.int32)
+        return np.array([size for _, size in self._classes], np.int32)
 
     def known_labels(self) -> np.ndarray:
         """int32 [S]: the classes of all states, -1 for those that were not met."""
@@ -81,18 +84,43 @@ class ClassBook:
         for index in _chunks(sizes, weights, graph.num_actions):
             size = int(sizes[index[0]])
             if is_oversized(size, graph.num_actions):
-                keys = [b"state %d" % state for state in states[index]]
+                keys = [_own_key(state) for state in states[index]]
             else:
                 models = self._maker.make(states[index], size, members[index])
                 labels = self._maker.scaled(models.labels)
                 forms, _ = canonical_forms(models.transition, quantum_bits(graph.dtype), labels)
-                keys = [hashlib.blake2b(form, digest_size=16).digest() for form in forms]
+                keys = [hashlib.blake2b(form, digest_size=_KEY_BYTES).digest() for form in forms]
             for state, key in zip(states[index].tolist(), keys, strict=True):
-                number = self._class_of_key.setdefault(key, len(self))
-                if number == len(self):
-                    self._representative.append(state)
-                    self._size.append(size)
-                self._label[state] = number
+                if key not in self._class_of_key:
+                    self._classes.append((state, size))
+                    self._class_of_key[key] = len(self) - 1
+                self._label[state] = self._class_of_key[key]
+
+    def contents(self) -> dict[str, np.ndarray]:
+        """All classes, as plain arrays for `restore`: of each of S states, -1 if unknown, and what tells C of them."""
+        key = np.zeros((len(self), _KEY_BYTES), np.uint8)
+        for name, number in self._class_of_key.items():
+            if len(name) == _KEY_BYTES:  # others are made of their states
+                key[number] = np.frombuffer(name, np.uint8)
+        return {"class_of_state": self.known_labels(), "representative": self.representative, "class_key": key}
+
+    def restore(self, contents: Mapping[str, np.ndarray]) -> None:
+        """Fills an empty book with the `contents` of another; `ValueError` where they are none."""
+        graph = self._maker.graph
+        states = checks.require_integers("representative", contents["representative"], upper=graph.num_states)
+        checks.require_shape("representative", states, "[C]", states.ndim == 1)
+        label, key = contents["class_of_state"], contents["class_key"]
+        checks.require_shape("class_of_state", label, f"({graph.num_states},)", label.shape == (graph.num_states,))
+        checks.require_integers("class_of_state", label[label != -1], upper=len(states))
+        checks.require_shape("class_key", key, f"({len(states)}, {_KEY_BYTES})", key.shape == (len(states), _KEY_BYTES))
+        key = checks.require_integers("class_key", key, upper=256).astype(np.uint8)
+        size = np.diff(self._maker.members(states).indptr)
+        is_alone = is_oversized(size, graph.num_actions)
+        told = zip(states, is_alone, key, strict=True)
+        names = (_own_key(state) if alone else row.tobytes() for state, alone, row in told)
+        self._class_of_key = {name: number for number, name in enumerate(names)}
+        self._classes = list(zip(states.tolist(), size.tolist(), strict=True))
+        self._label[:] = label
 
 
 def local_model_classes(mdp: MDP, states=None, distance: int = 1) -> LocalModelClasses:
@@ -143,6 +171,11 @@ def isomorphism(one: np.ndarray, other: np.ndarray, labels=None) -> np.ndarray |
     renaming = np.empty(len(one), int)
     renaming[order[0]] = order[1]
     return renaming
+
+
+def _own_key(state: int) -> bytes:
+    """Of a class of its own; no longer or shorter than others' by accident."""
+    return b"the class of state %d alone" % state
 
 
 def _chunks(sizes: np.ndarray, weights: np.ndarray, num_actions: int) -> Iterator[np.ndarray]:

@@ -9,12 +9,14 @@ bound already excludes is not solved. The permutation that is carried over to vo
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom import checks
+from jaxhom.similarity.brackets import Goal, LocalSimilarity, Progress, no_progress
 from jaxhom.similarity.canonical_forms import canonical_forms
 from jaxhom.similarity.class_pairs import ClassModels, ClassPairs
 from jaxhom.similarity.classes import quantum_bits
@@ -61,7 +63,7 @@ class LaxPairs:
         """How many programs have been solved."""
         return self._programs.num_solved
 
-    def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+    def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, progress: Progress = no_progress) -> LocalSimilarity:
         """Bounds on the least errors of different ordered pairs of classes."""
         apart = self._errors_of_actions(pairs, goal)
         # Every action stands for some other, and some other for it, whatever the permutation.
@@ -73,12 +75,14 @@ class LaxPairs:
             status=np.full(len(pairs), Status.SOLVED, np.int32),
         )
         (waiting,) = np.nonzero(~(floor > goal.threshold))
+        progress(len(pairs) - len(waiting))
         for part in np.array_split(waiting, 1 + len(waiting) * len(self._orders) // _CHUNK):
-            found = self._least_errors(pairs[part], apart[part], goal, progress)
+            found = self._least_errors(pairs[part], apart[part], goal)
+            progress(len(part))
             jax.tree.map(lambda place, new, part=part: np.put(place, part, new), result, found)
         return result
 
-    def _least_errors(self, pairs, apart: Float[np.ndarray, "Q A A"], goal: Goal, progress: bool) -> LocalSimilarity:
+    def _least_errors(self, pairs, apart: Float[np.ndarray, "Q A A"], goal: Goal) -> LocalSimilarity:
         lower, best = self._bounds_by_actions(apart), np.full(len(pairs), np.inf)
         chosen_upper, chosen = np.full(len(pairs), np.inf), np.zeros(len(pairs), int)
         iterations, status = np.zeros(len(pairs), np.int32), np.full(len(pairs), Status.SOLVED, np.int32)
@@ -89,7 +93,7 @@ class LaxPairs:
             (asked,) = np.nonzero(is_open)
             if not asked.size:
                 continue
-            found = self._programs.brackets(self._renamed(pairs[asked], rank), goal, progress=progress)
+            found = self._programs.brackets(self._renamed(pairs[asked], rank), goal)
             lower[asked, rank] = np.fmax(lower[asked, rank], found.lower)
             best[asked] = np.minimum(best[asked], found.upper)
             iterations[asked] += found.iterations
@@ -130,6 +134,20 @@ class LaxPairs:
         if missing:
             self.brackets(np.array(missing), Goal(tolerance=_TOLERANCE))
         return self._orders[[self._chosen[key] for key in keys]]
+
+    def contents(self) -> dict[str, np.ndarray]:
+        """The permutations that were chosen, as plain arrays for `restore`."""
+        pairs = np.array(list(self._chosen), np.int32).reshape(-1, 2)
+        return {"renamed_pairs": pairs, "renaming": np.array(list(self._chosen.values()), np.int32)}
+
+    def restore(self, contents: Mapping[str, np.ndarray], num_classes: int) -> None:
+        """Fills in the `contents` of another; `ValueError` where they are none."""
+        pairs, rank = (contents.get(name, np.zeros(0, bool)) for name in ("renamed_pairs", "renaming"))
+        checks.require_shape("renamed_pairs", pairs, "[Q, 2]", pairs.ndim == 2 and pairs.shape[1] == 2)
+        checks.require_shape("renaming", rank, f"({len(pairs)},)", rank.shape == (len(pairs),))
+        pairs = checks.require_integers("renamed_pairs", pairs, upper=num_classes)
+        rank = checks.require_integers("renaming", rank, upper=len(self._orders))
+        self._chosen = dict(zip(map(tuple, pairs.tolist()), rank.tolist(), strict=True))
 
     def _renamed(self, pairs, rank) -> Int[np.ndarray, "Q 2"]:
         """The pairs with the actions of the targets renamed, as `_RenamedModels` numbers them."""

@@ -11,10 +11,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from tqdm import tqdm
 
 from jaxhom import checks
-from jaxhom.similarity.brackets import Goal, LocalSimilarity
+from jaxhom.similarity.brackets import Goal, LocalSimilarity, Progress, no_progress
 from jaxhom.similarity.canonical_forms import are_isomorphic, stable_colours
 from jaxhom.similarity.class_pairs import ClassModels, ClassPairs, LocalModel
 from jaxhom.similarity.classes import quantum_bits
@@ -44,8 +43,8 @@ class PairErrors(Protocol):
     num_solved: int
     has_maps: bool
 
-    def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, *, progress: bool = False) -> LocalSimilarity:
-        """Bounds for different ordered pairs of classes."""
+    def brackets(self, pairs: Int[np.ndarray, "Q 2"], goal: Goal, progress: Progress = no_progress) -> LocalSimilarity:
+        """Bounds for different ordered pairs of classes; `progress` is called with how many just finished."""
 
     def slack(self, pairs: Int[np.ndarray, "Q 2"]) -> Float[np.ndarray, " Q"]:
         """How far the errors of other members of two classes can lie from those of the models that stand for them."""
@@ -85,14 +84,13 @@ class _WithoutPrograms:
     def __init__(self, models: ClassModels, anchored: bool):
         self._models, self._anchored, self._dtype = models, anchored, models.dtype
 
-    def brackets(self, pairs, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+    def brackets(self, pairs, goal: Goal, progress: Progress = no_progress) -> LocalSimilarity:
         """Bounds; nothing but that they are at most 1 for models that are too large to be looked at."""
         del goal
         is_large = is_oversized(self._models.size, self._models.num_actions)[pairs].any(axis=1)
         bounds = np.tile([0.0, 1.0], (len(pairs), 1))
-        with tqdm(total=len(pairs), desc="similarity", unit="pair", leave=False, disable=not progress) as bar:
-            bar.update(int(is_large.sum()))
-            bounds[~is_large] = self._bounds(pairs[~is_large], bar.update)
+        progress(int(is_large.sum()))
+        bounds[~is_large] = self._bounds(pairs[~is_large], progress)
         lower, upper = bounds.T
         return LocalSimilarity(
             lower=np.maximum(_towards(lower, -np.inf, self._dtype), 0.0),
@@ -101,7 +99,7 @@ class _WithoutPrograms:
             status=np.where(is_large, Status.ITERATION_LIMIT, Status.SOLVED).astype(np.int32),
         )
 
-    def _bounds(self, pairs, progress: Callable[[int], object]) -> Float[np.ndarray, "Q 2"]:
+    def _bounds(self, pairs, progress: Progress) -> Float[np.ndarray, "Q 2"]:
         """Lower and upper bounds of pairs of models that are not too large."""
         raise NotImplementedError
 
@@ -126,9 +124,9 @@ class _Isomorphic(_WithoutPrograms):
         super().__init__(models, anchored)
         self._colours: dict[int, bytes] = {}
 
-    def brackets(self, pairs, goal: Goal, *, progress: bool = False) -> LocalSimilarity:
+    def brackets(self, pairs, goal: Goal, progress: Progress = no_progress) -> LocalSimilarity:
         """Models that are too large to be looked at are not told apart, but from themselves."""
-        found = super().brackets(pairs, goal, progress=progress)
+        found = super().brackets(pairs, goal, progress)
         same = pairs[:, 0] == pairs[:, 1]
         upper, status = np.where(same, 0.0, found.upper), np.where(same, Status.SOLVED, found.status)
         is_open = found.lower < upper
@@ -169,11 +167,12 @@ class _WeisfeilerLehman(_WithoutPrograms):
 
     def _bounds(self, pairs, progress):
         if self._num_classes < len(self._models.size):
-            self._num_classes = len(self._models.size)
+            num_classes = len(self._models.size)
             is_small = ~is_oversized(self._models.size, self._models.num_actions)
             self._row = np.cumsum(is_small) - 1
             known = [self._models.alone(number, is_scaled=True) for number in np.flatnonzero(is_small)]
             self._features = colour_counts(known, quantum_bits(self._dtype), anchored=self._anchored)
+            self._num_classes = num_classes  # last: what is interrupted begins anew
         progress(len(pairs))
         return _one_minus(cosines(self._features, self._row[pairs]))
 
@@ -190,14 +189,13 @@ class _RandomWalk(_WithoutPrograms):
         self._own = np.append(self._own, self._kernel(np.stack([fresh, fresh], axis=1)))
         return _one_minus(self._kernel(pairs, progress) / np.sqrt(self._own[pairs].prod(axis=1)))
 
-    def _kernel(self, pairs, progress=None):
+    def _kernel(self, pairs, progress: Progress = no_progress):
         result = np.ones(len(pairs))
         for index, source, target in self._models.of_pairs(pairs):
             labels = () if source.labels is None else (source.labels, target.labels)
             sides = source.transition, target.transition, source.size, target.size
             result[index] = walks_in_common(*sides, labels, anchored=self._anchored)
-            if progress:
-                progress(len(index))
+            progress(len(index))
         return result
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
@@ -31,11 +31,13 @@ from jaxhom.similarity.decisions import (
     is_similar,
     require_decided,
 )
+from jaxhom.similarity.lax_pairs import LaxPairs
 from jaxhom.similarity.local_models import LocalModelMaker, require_concrete
 from jaxhom.similarity.maps import CertifiedMaps, carry_maps
 from jaxhom.similarity.pair_bounds import PairBounds, pair_keys, pair_set
 from jaxhom.similarity.relations import UserRelation, pair_errors
-from jaxhom.solvers.lane_queue import is_settled
+from jaxhom.similarity.settling import Settling
+from jaxhom.similarity.table_contents import heading, identity, options_in
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Int, Num
@@ -79,19 +81,22 @@ class SimilarityTable:
           (Taylor et al. 2008). Votes are renamed back by the permutation.
         * a function of two local models, source and target, with `.states`, `.transition` [n, A, n] and `.labels`
           [n, A, L] or None in NumPy: it returns whether they are similar, an error of at least 0, or bounds on one.
+      across_processes: share the work out to all processes of `jax.distributed`. All of them have to ask their tables
+        the same, in the same order, and all get the whole answer. An error or Ctrl-C in one ends the call in all.
 
     Attributes:
-      mdp, distance, anchored: as given.
+      mdp, distance, anchored, across_processes: as given.
       labels: [S, A, L], weighted; None if none were given.
       compares: the relation as given; its name if it is a function.
-      num_solved: how many programs have been solved, each for a pair of classes.
+      num_solved: how many programs have been solved, each for a pair of classes; by this process.
 
     Raises:
       ValueError: if the model is traced, an option out of range, or labels do not fit.
 
     The table grows by what it is asked; it belongs to the host and is no pytree. Threads may share it. It takes
     concrete values alone, inside jit, vmap and grad too. Completed, it answers for traced demonstrations: see
-    `complete`.
+    `complete`. What was solved stays when a call is interrupted: asked again, the table goes on from there.
+    `interop.save_similarity` and `interop.load_similarity` keep it in a file.
 
     Example:
       >>> import jaxhom
@@ -116,6 +121,7 @@ class SimilarityTable:
         labels: Num[ArrayLike, "S A L"] | Num[ArrayLike, "S L"] | None = None,
         label_weight: float = 1.0,
         relation: str | UserRelation = "homomorphism",
+        across_processes: bool = False,
     ):
         self.mdp = as_model(mdp)
         require_concrete(self.mdp)
@@ -124,13 +130,62 @@ class SimilarityTable:
         self.labels = None if labels is None else check_labels(self.mdp, labels, label_weight)
         if labels is None and checks.require_number("label_weight", label_weight) != 1.0:
             raise ValueError(f"label_weight is {checks.in_one_line(label_weight)}, and there are no labels")
-        self.given_relation = relation
+        self.given_relation, self.across_processes = relation, bool(across_processes)
+        if across_processes and self.renames:
+            raise ValueError('relation="lax" is not shared by processes: give each a table of its own')
         self._maker = LocalModelMaker(host_graph(self.mdp), self.distance, self.labels)
         self._book = ClassBook(self._maker)
         self._pairs = pair_errors(relation, ClassModels(self._maker, self._book), self.anchored)
         self._known = PairBounds(self.mdp.dtype)
+        about = (self.mdp, self.compares, self.distance, self.anchored, self.labels)
+        self._settling = Settling(self._pairs, self._book, identity(*about) if self.across_processes else None)
         self._lock = threading.RLock()
         self._maps: dict[tuple[int, int], tuple[np.ndarray, LocalSimilarity]] = {}
+
+    @_one_at_a_time
+    def contents(self) -> dict[str, np.ndarray]:
+        """All that is known of the errors, by name, as plain arrays: `restored` makes a table of them.
+
+        Maps and models are not among them.
+
+        Raises:
+          ValueError: if the relation is a function.
+        """
+        renamings = self._pairs.contents() if isinstance(self._pairs, LaxPairs) else {}
+        about = heading(self.mdp, self.given_relation, self.distance, self.anchored, self.labels)
+        return {**about, **self._book.contents(), **self._known.contents(), **renamings}
+
+    @classmethod
+    @checks.eager_where_concrete
+    def restored(
+        cls, mdp: MDP, contents: Mapping[str, np.ndarray], *, across_processes: bool = False
+    ) -> SimilarityTable:
+        """A table that knows what another one did, whose `contents` these are; it solves none of it again.
+
+        Args:
+          mdp: the model that it was made for: its transitions, allowed actions and number type.
+          contents: arrays by name.
+          across_processes: as in `SimilarityTable`; all processes have to come with the same contents.
+
+        Raises:
+          ValueError: if they are a table's for another model, or no table's.
+
+        Example:
+          >>> import jaxhom
+          >>> grid = jaxhom.gridworld(4)
+          >>> table = jaxhom.SimilarityTable(grid).complete(threshold=0.2)
+          >>> again = jaxhom.SimilarityTable.restored(grid, table.contents())
+          >>> again.complete(threshold=0.2).num_solved
+          0
+        """
+        model = as_model(mdp)
+        require_concrete(model)
+        table = cls(model, **options_in(contents, model), across_processes=across_processes)
+        table._book.restore(contents)
+        table._known.restore(contents, table.num_classes)
+        if isinstance(table._pairs, LaxPairs):
+            table._pairs.restore(contents, table.num_classes)
+        return table
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "_lock"}
@@ -195,16 +250,18 @@ class SimilarityTable:
         method: str = "auto",
         max_iterations: int = 100_000,
         progress: bool = False,
+        keep: bool = True,
     ) -> LocalSimilarity:
         """Brackets the optimal error e of LP (9) for pairs of states, from M^{s,d} to M^{s',d}.
 
         Arguments, result and errors are those of `local_similarity`. Only pairs of classes whose bounds are not yet
-        that close are solved.
+        that close are solved. With keep=False their bounds are not kept, for more pairs than memory holds.
         """
         goal = Goal.checked(tolerance=tolerance, method=method, max_iterations=max_iterations)
         pairs, where = self._pairs_of(*self._validated_pairs(sources, targets))
-        self._settle(pairs, goal, progress)
-        return jax.tree.map(lambda leaf: leaf[where], self._widened(pairs, goal))
+        known = self._known if keep else self._known.part(pairs)
+        self._settling.settle(pairs, goal, known, progress=progress)
+        return jax.tree.map(lambda leaf: leaf[where], self._settling.widened(pairs, goal, known))
 
     @checks.eager_where_concrete
     @_one_at_a_time
@@ -377,17 +434,19 @@ class SimilarityTable:
         sources, targets = self._validated_pairs(sources, targets)
         pairs, where = self._pairs_of(sources, targets)
         goal = Goal(tolerance=_MAP_TOLERANCE[np.dtype(self.mdp.dtype).name], method="pdhg")
+        # One process may explain alone: tables that processes share stay the same.
+        known = self._known.part(pairs) if self.across_processes else self._known
         for pair in pairs:
             key = tuple(pair.tolist())
             if key not in self._maps:
                 found, f = self._pairs.map_of(pair, goal)
-                self._known.add(pair[None], found)
                 self._maps[key] = f, found
+            known.add(pair[None], self._maps[key][1])
         # The upper bound is that of the map, which a better one that is known need not prove.
         own = [self._maps[tuple(pair)] for pair in pairs.tolist()]
         upper = np.array([found.upper[0] for _, found in own], self.mdp.dtype) + self._pairs.slack(pairs)
-        known = self._widened(pairs, goal).replace(upper=upper)
-        bounds = known.replace(status=honest_status(goal.is_met(known.lower, upper), known.status))
+        bounds = self._settling.widened(pairs, goal, known).replace(upper=upper)
+        bounds = bounds.replace(status=honest_status(goal.is_met(bounds.lower, upper), bounds.status))
         return carry_maps(
             self._maker,
             (sources, targets),
@@ -407,16 +466,11 @@ class SimilarityTable:
 
     def _settle(self, pairs: np.ndarray, goal: Goal, progress: bool) -> None:
         """Solves those of different pairs of classes [Q, 2] that are open, unless that was tried before."""
-        pairs = pairs[self._is_to_solve(pairs, goal)]
-        if len(pairs):
-            self._known.add(pairs, self._pairs.brackets(pairs, goal, progress=progress), goal)
+        self._settling.settle(pairs, goal, self._known, progress=progress)
 
     def _is_to_solve(self, pairs: np.ndarray, goal: Goal) -> np.ndarray:
         """bool [Q]: whether pairs of classes are open, and were not tried before."""
-        known = self._known.look_up(pairs)
-        tolerance = self._pairs.tolerance(goal, self._pairs.slack(pairs))
-        is_open = ~is_settled(known.lower, known.upper, tolerance, goal.threshold)
-        return is_open & ~self._known.was_tried(pairs, goal)
+        return self._settling.is_to_solve(pairs, goal, self._known)
 
     def _decided(self, pairs: np.ndarray, goal: Goal, mutual: bool) -> Decisions:
         """What is known of pairs of classes [Q, 2], in both directions if `mutual`."""
@@ -429,9 +483,7 @@ class SimilarityTable:
 
     def _widened(self, pairs: np.ndarray, goal: Goal) -> LocalSimilarity:
         """What is known of pairs of classes, for all states of these classes."""
-        known, slack = self._known.look_up(pairs), self._pairs.slack(pairs)
-        lower, upper = np.maximum(known.lower - slack, 0), known.upper + slack
-        return known.replace(lower=lower, upper=upper, status=honest_status(goal.is_met(lower, upper), known.status))
+        return self._settling.widened(pairs, goal, self._known)
 
     def _pairs_of(self, sources: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The different pairs of classes [Q, 2] of pairs of states, and which of them each is, [P]."""

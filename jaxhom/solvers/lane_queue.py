@@ -64,7 +64,7 @@ def solve_many(
       threshold: None, or scalar or [P]: what the method may decide instead of reaching the gap.
       max_iterations: per problem.
       lanes: width of the batch on each device.
-      devices: over which the batch is sharded; all of JAX's default backend if None.
+      devices: over which the batch is sharded; all that this process has of JAX's default backend if None.
       keep: names of the state's fields to return; all if None.
       progress: called with the number of problems that just finished.
 
@@ -72,7 +72,7 @@ def solve_many(
       Fields of the final state of every problem, [P] last, in NumPy arrays.
     """
     queue = _Queue(problem, threshold, keep)
-    devices = jax.devices() if devices is None else devices
+    devices = jax.local_devices() if devices is None else devices
     lanes *= len(devices)
     workers = min(_num_workers(devices), max(1, queue.total // lanes))
     lock = threading.Lock()

@@ -384,3 +384,27 @@ def test_a_signal_interrupts(files):
     assert not files["out/policy.npz"].exists()
     assert files.policy("out/generalization.npz").shape == (STATES, ACTIONS)
     assert not list(files["out"].glob("*.partial"))
+
+
+def test_a_table_goes_on_where_it_was_interrupted(files, monkeypatch, capsys):
+    """The second run knows what the first one solved; a third, with another option, is refused."""
+    arguments = ["learn", *files.options(), "--threshold", "0.3", "--no-pictures", "--table", files.path("table.npz")]
+    plain = jaxhom.SimilarityTable.decisions
+
+    def interrupted(*arguments, **options):
+        plain(*arguments, **options)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jaxhom.SimilarityTable, "decisions", interrupted)
+        assert main(arguments) == 130
+    begun = len(files.arrays("table.npz")["pairs"])
+    assert begun
+    for _ in range(2):
+        assert main(arguments) == 0
+    assert begun < len(files.arrays("table.npz")["pairs"])
+    assert files.arrays("out/policy.npz")["pairs_of_classes_solved"] == 0
+    capsys.readouterr()
+    assert main([*arguments, "--distance", "2"]) == 2
+    assert "table was made with distance=1" in capsys.readouterr().err
+    assert main([*arguments[:-1], files.path("missing/table.npz")]) == 2

@@ -4,13 +4,15 @@ import concurrent.futures
 import copy
 import functools
 import pickle
+import sys
 
 import numpy as np
 import oracles
 import pytest
 
 from jaxhom import MDP, SimilarityTable, Status, gridworld, local_similarity, locally_similar, programs, racetrack
-from jaxhom.similarity import class_pairs
+from jaxhom.similarity import class_pairs, classes, pair_bounds, relations, settling
+from jaxhom.similarity import table as table_module
 from jaxhom.similarity.local_models import local_models
 
 
@@ -146,6 +148,47 @@ def test_maps_are_carried_over_to_every_member_of_a_class(dtype):
         assert np.abs(product).max() <= found.upper[p] + 1e-12 and f[0, 0] > 0.999
     assert (found.status == Status.SOLVED).all()
     assert (found.upper - found.lower).max() <= (1e-6 if dtype == np.float64 else 1e-4)
+
+
+def interrupted_at(line, files, call):
+    """Whether a call was interrupted, at the given line of all that it runs of some files."""
+    left = [line]
+
+    def trace(frame, event, _):
+        if event == "line" and frame.f_code.co_filename in files:
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+        return trace if event != "call" or frame.f_code.co_filename in files else None
+
+    former = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(former)
+    return False
+
+
+@pytest.mark.parametrize("relation", ["weisfeiler_lehman", "homomorphism"])
+def test_an_interruption_at_any_line_loses_time_and_no_truth(relation):
+    """Asked again, the table answers as one that was never interrupted."""
+    transition, asked = np.asarray(model().transition)[:7, :, :7], ([0, 1, 3], [5, 0, 6])
+    make = functools.partial(SimilarityTable, MDP.from_dense(transition, discount=0.9), relation=relation)
+    expected, files = make(), {module.__file__ for module in (classes, pair_bounds, relations, settling, table_module)}
+    bounds = expected.brackets(*asked, tolerance=1e-2)
+    for line in range(0, 10**6, 5 if relation == "weisfeiler_lehman" else 23):
+        table = make()
+        table.brackets([0], [3], tolerance=1e-2)
+        is_over = not interrupted_at(line, files, lambda table=table: table.brackets(*asked, tolerance=1e-2))
+        found = table.brackets(*asked, tolerance=1e-2)
+        for name, leaf in dict(bounds).items():
+            np.testing.assert_allclose(found[name], leaf, atol=1e-9)
+        if is_over:
+            break
+    assert line > 100
 
 
 def test_it_says_what_it_holds():

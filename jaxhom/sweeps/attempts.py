@@ -76,7 +76,7 @@ def attempt(work: Callable | Shipped, given: Any, is_batch: bool) -> list[dict[s
     start = time.perf_counter()
     results = _results(work, cases, is_batch)
     seconds = (time.perf_counter() - start) / len(cases)
-    of_worker = {"seconds": seconds, "host": platform.node(), "x64": bool(jax.config.jax_enable_x64)}  # type: ignore[attr-defined]
+    of_worker: dict[str, Plain] = {"seconds": seconds, "host": platform.node(), "x64": bool(jax.config.jax_enable_x64)}  # type: ignore[attr-defined]
     return [{**result, **of_worker, "versions": versions(*LIBRARIES)} for result in results]
 
 

@@ -62,7 +62,8 @@ def checked_jobs(cases: Iterable[Any]) -> list[Job]:
     """
     if isinstance(cases, (str, bytes, Mapping)) or not isinstance(cases, Iterable):
         raise ValueError(f"cases must be a sequence of mappings, got {checks.in_one_line(cases)}")
-    jobs, seen = [], {}
+    jobs: list[Job] = []
+    seen: dict[str, str] = {}
     for index, item in enumerate(cases):
         is_batch = isinstance(item, (list, tuple))
         if is_batch and not item:

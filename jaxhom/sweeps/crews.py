@@ -71,10 +71,11 @@ def crew_of(executor: Any, in_flight: int | None) -> Iterator[Crew]:
 @contextlib.contextmanager
 def _processes_of(count: Any, in_flight: int | None) -> Iterator[Crew]:
     try:
-        count = checks.require_count("executor", operator.index(count))
+        operator.index(count)
     except TypeError:
         what = "None, a number of processes, a concurrent.futures.Executor or a client of Dask"
         raise ValueError(f"executor must be {what}, got {checks.in_one_line(count)}") from None
+    count = checks.require_count("executor", count)
     crew = Crew(_processes(count), in_flight or 2 * count, lambda: _processes(count))
     try:
         yield crew

@@ -128,8 +128,8 @@ class Dispatch:
         if lane.deaths < _MOST_DEATHS:
             self._suspects.append(lane)
         elif len(job.cases) > 1:
-            lane.jobs[-1:], lane.deaths = job.split()[::-1], _MOST_DEATHS - 1
-            self._suspects.append(lane)
+            self._suspects.extend(_Lane([one], _MOST_DEATHS - 1) for one in job.split())
+            self._done(lane, [], [])
         else:
             self._done(lane, [{"error": "its worker died, again and again"}], outcomes)
 
@@ -144,8 +144,7 @@ class Dispatch:
     def _stop(self) -> None:
         """Waits for what cannot be taken back; at a further Ctrl-C not even for that."""
         left = {future: lane for future, (lane, _) in self._running.items() if not future.cancel()}
-        if not all(future.done() for future in left):
-            tqdm.write("stopping as soon as what is in progress is done", file=sys.stderr)
+        tqdm.write("stopping as soon as what is in progress is done", file=sys.stderr)
         try:
             wait(left)
         finally:

@@ -1,6 +1,6 @@
 """Text files that are only ever appended to, whole lines at a time, by one process, and survive being stopped anywhere.
 
-What `append` was given is on the disk when it returns, or not in the file at all. A line that a kill cut short is
+What `write` was given is on the disk when it returns, or not in the file at all. A line that a kill cut short is
 dropped when the file is next written to. The lock is the system's: it ends with the process that holds it.
 """
 
@@ -76,16 +76,16 @@ class LineFile:
             _HELD.discard(self._descriptor)
             os.close(self._descriptor)
 
-    def append(self, text: str) -> None:
+    def write(self, text: str) -> None:
         """Writes whole lines in one piece, and has the disk hold them before it returns; within `writing` only."""
         before, left = os.fstat(self._descriptor).st_size, memoryview(text.encode())
         try:
             while left:
                 left = left[os.write(self._descriptor, left) :]
-            os.fsync(self._descriptor)
         except BaseException:  # a full disk, Ctrl-C
             os.ftruncate(self._descriptor, before)
             raise
+        os.fsync(self._descriptor)
 
     def _lock(self) -> None:
         if fcntl is not None:

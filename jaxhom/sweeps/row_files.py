@@ -70,7 +70,7 @@ class RowFile(LineFile):
     def add(self, finished: Sequence[tuple[Case, Mapping[str, Plain]]]) -> None:
         """Writes rows: cases, and what was found."""
         lines = [{**case.columns, **found, "case": list(case.columns)} for case, found in finished]
-        self.append("".join(json.dumps(line) + "\n" for line in lines))
+        self.write("".join(json.dumps(line) + "\n" for line in lines))
 
 
 def read(file: str | os.PathLike) -> list[dict[str, Any]]:

@@ -3,11 +3,12 @@
 import os
 import tempfile
 
+import distributed
 import jax
 import numpy as np
 
 import jaxhom
-from jaxhom import interop, plotting
+from jaxhom import interop, plotting, sweeps
 
 jax.config.update("jax_enable_x64", True)
 
@@ -44,3 +45,16 @@ with tempfile.TemporaryDirectory() as folder:
     interop.save_mdp(os.path.join(folder, "model.npz"), lake.mdp)
     assert interop.load_mdp(os.path.join(folder, "model.npz")).num_states == 16
     plotting.plot_policy(world, learned.policy).figure.savefig(os.path.join(folder, "policy.png"))
+
+# A sweep, by Dask.
+options = {"n_workers": 1, "dashboard_address": None}
+with (
+    tempfile.TemporaryDirectory() as folder,
+    distributed.LocalCluster(processes=False, **options) as cluster,
+    distributed.Client(cluster) as client,
+):
+    cases = [{"draw": draw} for draw in range(3)]
+    rows = sweeps.run(
+        lambda case: {"twice": 2 * case["draw"]}, cases, os.path.join(folder, "rows.jsonl"), executor=client
+    )
+assert [row["twice"] for row in rows] == [0, 2, 4]

@@ -1,6 +1,6 @@
 """Hands out jobs, a bounded number at a time, and hands on what comes back, until nothing is left.
 
-Jobs of one lane go one after another. Where a worker died, whatever was in its pool is tried again, one job at a time
+Jobs of one group go one after another. Where a worker died, whatever was in its pool is tried again, one job at a time
 with nothing beside it, so that a job that takes its worker with it is found, and no other is blamed.
 """
 
@@ -24,7 +24,7 @@ _MOST_DEATHS = 3  # of workers, until a job is given up
 
 
 @dataclasses.dataclass(slots=True)
-class _Lane:
+class _Group:
     """Jobs of one group that are left, the next one last, and how many workers that one has cost."""
 
     jobs: list[Job]
@@ -36,7 +36,7 @@ class Dispatch:
 
     Args:
       work: what is called, as its crew takes it.
-      lanes: the jobs, those of one group together.
+      groups: the jobs, those of one group together.
       crew: who does them.
       write: gets what has come back.
     """
@@ -44,14 +44,14 @@ class Dispatch:
     def __init__(
         self,
         work: Callable | Shipped,
-        lanes: Iterable[Iterable[Job]],
+        groups: Iterable[Iterable[Job]],
         crew: Crew,
         write: Callable[[list[Outcome]], None],
     ):
         self._work, self._crew, self._write = work, crew, write
-        self._lanes = collections.deque(_Lane(list(jobs)[::-1]) for jobs in lanes)
-        self._suspects: collections.deque[_Lane] = collections.deque()
-        self._running: dict[Future, tuple[_Lane, Executor]] = {}
+        self._groups = collections.deque(_Group(list(jobs)[::-1]) for jobs in groups)
+        self._suspects: collections.deque[_Group] = collections.deque()
+        self._running: dict[Future, tuple[_Group, Executor]] = {}
         self._back: queue.SimpleQueue[Future] = queue.SimpleQueue()
 
     def run(self) -> None:
@@ -62,7 +62,7 @@ class Dispatch:
           KeyboardInterrupt: and whatever else comes in between; first, what is in progress is finished and written.
         """
         try:
-            while self._running or self._lanes or self._suspects:
+            while self._running or self._groups or self._suspects:
                 self._hand_out()
                 self._take()
         except BaseException:
@@ -71,18 +71,19 @@ class Dispatch:
 
     def _hand_out(self) -> None:
         limit = 1 if self._suspects else self._crew.in_flight
-        while len(self._running) < limit and (self._suspects or self._lanes):
-            lane = (self._suspects or self._lanes).popleft()
-            job, executor = lane.jobs[-1], self._crew.executor
+        while len(self._running) < limit and (self._suspects or self._groups):
+            source = self._suspects or self._groups
+            group = source.popleft()
+            job, executor = group.jobs[-1], self._crew.executor
             try:
                 future = executor.submit(attempt, self._work, job.given, job.is_batch)
             except BrokenExecutor as error:  # found out before the jobs in it come back
-                self._lanes.appendleft(lane)
+                source.appendleft(group)
                 self._renew(executor, error)
                 return
             except Exception as error:
                 raise RuntimeError(_gave_up(error)) from error
-            self._running[future] = lane, executor
+            self._running[future] = group, executor
             future.add_done_callback(self._back.put)
 
     def _take(self) -> None:
@@ -101,37 +102,41 @@ class Dispatch:
             self._write_all(outcomes)
 
     def _settle(self, future: Future, outcomes: list[Outcome]) -> None:
-        lane, executor = self._running.pop(future)
+        group, executor = self._running.pop(future)
         try:
             found = future.result()
         except Exception as error:
-            self._lost(lane, executor, error, outcomes)
+            self._lost(group, executor, error, outcomes)
         else:
-            self._done(lane, found, outcomes)
+            self._done(group, found, outcomes)
 
-    def _done(self, lane: _Lane, found: list[dict[str, Plain]], outcomes: list[Outcome]) -> None:
-        outcomes.append((lane.jobs.pop(), found))
-        lane.deaths = 0
-        if lane.jobs:
-            self._lanes.appendleft(lane)  # what it shares with the next one is still there
+    def _done(self, group: _Group, found: list[dict[str, Plain]], outcomes: list[Outcome]) -> None:
+        outcomes.append((group.jobs[-1], found))
+        self._go_on(group)
 
-    def _lost(self, lane: _Lane, executor: Executor, error: Exception, outcomes: list[Outcome]) -> None:
+    def _go_on(self, group: _Group) -> None:
+        group.jobs.pop()
+        group.deaths = 0
+        if group.jobs:
+            self._groups.appendleft(group)  # what it shares with the next one is still there
+
+    def _lost(self, group: _Group, executor: Executor, error: Exception, outcomes: list[Outcome]) -> None:
         """A job without an answer: again if its worker died, up to a limit; else the executor itself has failed."""
         if isinstance(error, BrokenExecutor):
             self._renew(executor, error)
-            lane.deaths += 1
+            group.deaths += 1
         elif type(error).__name__ == "KilledWorker":  # Dask has tried several times, with others beside it perhaps
-            lane.deaths = _MOST_DEATHS if lane.deaths else 1
+            group.deaths = _MOST_DEATHS if group.deaths else 1
         else:
             raise RuntimeError(_gave_up(error)) from error
-        job = lane.jobs[-1]
-        if lane.deaths < _MOST_DEATHS:
-            self._suspects.append(lane)
+        job = group.jobs[-1]
+        if group.deaths < _MOST_DEATHS:
+            self._suspects.append(group)
         elif len(job.cases) > 1:
-            self._suspects.extend(_Lane([one], _MOST_DEATHS - 1) for one in job.split())
-            self._done(lane, [], [])
+            self._suspects.extend(_Group([one], _MOST_DEATHS - 1) for one in job.split())
+            self._go_on(group)
         else:
-            self._done(lane, [{"error": "its worker died, again and again"}], outcomes)
+            self._done(group, [{"error": "its worker died, again and again"}], outcomes)
 
     def _write_all(self, outcomes: list[Outcome]) -> None:
         if outcomes:
@@ -143,7 +148,7 @@ class Dispatch:
 
     def _stop(self) -> None:
         """Waits for what cannot be taken back; at a further Ctrl-C not even for that."""
-        left = {future: lane for future, (lane, _) in self._running.items() if not future.cancel()}
+        left = {future: group for future, (group, _) in self._running.items() if not future.cancel()}
         tqdm.write("stopping as soon as what is in progress is done", file=sys.stderr)
         try:
             wait(left)

@@ -117,7 +117,7 @@ def run_jobs(
     with rows.writing():
         done = rows.done(retry)
         left = [job for job in (job.only(lambda case: rows.key(case) not in done) for job in jobs) if job.cases]
-        lanes = _lanes(left, group)
+        groups = _groups(left, group)
         total, count = sum(len(job.cases) for job in jobs), sum(len(job.cases) for job in left)
         if not left:
             return
@@ -131,16 +131,16 @@ def run_jobs(
                 rows.add([(case, _row(columns, now, found_in)) for case, columns in finished])
                 bar.update(len(finished))
 
-            Dispatch(carried, lanes, crew, write).run()
+            Dispatch(carried, groups, crew, write).run()
 
 
-def _lanes(jobs: Sequence[Job], group: Callable[[Any], Hashable] | None) -> list[list[Job]]:
+def _groups(jobs: Sequence[Job], group: Callable[[Any], Hashable] | None) -> list[list[Job]]:
     """Jobs by group, in the order in which each comes first; without a name each has its own."""
-    lanes: dict[Hashable, list[Job]] = {}
+    groups: dict[Hashable, list[Job]] = {}
     for index, job in enumerate(jobs):
         name = checked_group(group, job)
-        lanes.setdefault(("", index) if name is None else (name,), []).append(job)
-    return list(lanes.values())
+        groups.setdefault(("", index) if name is None else (name,), []).append(job)
+    return list(groups.values())
 
 
 def _row(columns: Mapping[str, Plain], time: str, commit: str) -> dict[str, Plain]:

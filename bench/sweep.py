@@ -6,7 +6,8 @@ fails is tried draw by draw; a draw that fails is a row with its error, and the 
 
 import contextlib
 import dataclasses
-import functools
+import threading
+import weakref
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -108,7 +109,16 @@ def _of_setting(columns: dict) -> tuple:
     return tuple(columns[name] for name in _OF_SETTING)
 
 
-_problem = functools.lru_cache(maxsize=4)(draw_problem)  # two for each of two threads
+_alive: weakref.WeakValueDictionary[tuple, Problem] = weakref.WeakValueDictionary()
+_mine = threading.local()
+
+
+def _problem(setting: Setting, draws: tuple[int, ...], seed: int) -> Problem:
+    """That of the method before, mostly: problems live as long as they are the last one of a thread."""
+    key = (setting, draws, seed)
+    _mine.problem = problem = _alive.get(key) or draw_problem(*key)
+    _alive[key] = problem
+    return problem
 
 
 def _results(problem: Problem, method: Method, sampled: bool) -> list[dict]:

@@ -83,15 +83,14 @@ def run(
       >>> import pathlib, tempfile
       >>> import jaxhom
       >>> from jaxhom import sweeps
-      >>> def share_of_goal(case):
-      ...     world = jaxhom.gridworld(case["size"], num_regions=4, noise=case["noise"])
-      ...     plan = jaxhom.optimal_policy(world.mdp, world.mdp.features[..., 3])
-      ...     return {"share": 0.01 * (plan.value @ world.mdp.initial).round(1)}
-      >>> cases = [{"size": size, "noise": noise} for size in (4, 6) for noise in (0.0, 0.3)]
-      >>> file = pathlib.Path(tempfile.mkdtemp(), "rooms.jsonl")
-      >>> rows = sweeps.run(share_of_goal, cases, file, progress=False)
-      >>> [row["size"] for row in rows]
-      [4, 4, 6, 6]
+      >>> def time_in_the_corner(case):
+      ...     mdp = jaxhom.gridworld(4, num_regions=4, noise=case["noise"], discount=0.9).mdp
+      ...     plan = jaxhom.optimal_policy(mdp, mdp.features[..., 3])
+      ...     return {"share": 0.1 * plan.value @ mdp.initial}
+      >>> file = pathlib.Path(tempfile.mkdtemp(), "corner.jsonl")
+      >>> rows = sweeps.run(time_in_the_corner, [{"noise": 0.0}, {"noise": 0.5}], file, progress=False)
+      >>> [f"{row['noise']}: {row['share']:.2f}" for row in rows]
+      ['0.0: 0.66', '0.5: 0.44']
     """
     jobs, rows = checked_jobs(cases), RowFile(file)
     run_jobs(work, jobs, rows, executor=executor, retry=retry, group=group, in_flight=in_flight, progress=progress)

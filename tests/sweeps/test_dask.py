@@ -8,6 +8,8 @@ import sys
 import threading
 import time
 
+import dask
+import distributed
 import pytest
 import sweep_works
 from sweep_works import NUMBERS, deadly, expected, found, scaled
@@ -15,8 +17,6 @@ from sweep_works import NUMBERS, deadly, expected, found, scaled
 from bench import methods, reproduce, settings, sweep
 from bench.rows import RowFile
 from jaxhom import sweeps
-
-distributed = pytest.importorskip("distributed")
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_the_benchmarks_run_on_a_cluster(client, tmp_path, monkeypatch):
 
 
 def test_a_scheduler_that_is_not_there_is_said(tmp_path, capsys):
-    with distributed.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
+    with dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
         options = ["--output", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
         assert reproduce.main(["table1", *options]) == 2
     assert "bench: error: " in capsys.readouterr().err

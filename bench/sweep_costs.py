@@ -2,7 +2,8 @@
 
 Each executor, with 1, 2 and 4 workers on this machine, gets cases with nothing to do, which shows what handing out,
 coming back and writing to the disk cost; and Algorithm 1 on the paper's 16 x 16 grid with 64 regions. Workers have
-started, and have compiled what they need, before the clock starts. Rows go to `results/sweep_costs.csv`.
+started, and have compiled what they need, before the clock starts. Rows go to `results/sweep_costs.csv`: milliseconds
+per row by the clock, those that this process computed (with it Dask's scheduler), and those that `work` took.
 """
 
 import argparse
@@ -55,7 +56,7 @@ def algorithm1(case: dict) -> dict:
     return {"share": value / (expert.value @ mdp.initial)}
 
 
-WORK: dict[str, tuple[Callable, int]] = {"nothing": (nothing, 1000), "Algorithm 1": (algorithm1, 60)}
+WORK: dict[str, tuple[Callable, int]] = {"nothing": (nothing, 1000), "Algorithm 1": (algorithm1, 40)}
 """What is done, and on how many cases."""
 
 
@@ -65,12 +66,13 @@ def measure(executor: Any, workers: int, work: Callable, count: int) -> dict:
         file = pathlib.Path(folder, "rows.jsonl")
         first = [{"draw": -1 - draw} for draw in range(4 * workers)]
         sweeps.run(work, first, file, executor=executor, progress=False)
-        start = time.perf_counter()
+        start, start_here = time.perf_counter(), time.process_time()
         rows = sweeps.run(work, [{"draw": draw} for draw in range(count)], file, executor=executor, progress=False)
-        seconds = time.perf_counter() - start
+        seconds, seconds_here = time.perf_counter() - start, time.process_time() - start_here
     assert not any(row["error"] for row in rows)
     at_work = float(np.mean([row["seconds"] for row in rows]))
-    return {"rows": count, "seconds": seconds, "ms_per_row": 1e3 * seconds / count, "ms_at_work": 1e3 * at_work}
+    per_row = {"ms_per_row": seconds / count, "cpu_ms_here": seconds_here / count, "ms_at_work": at_work}
+    return {"rows": count, "seconds": seconds} | {name: 1e3 * number for name, number in per_row.items()}
 
 
 @contextlib.contextmanager
@@ -92,25 +94,31 @@ def started(name: str, workers: int) -> Iterator[Any]:
             yield client
 
 
+def _machine() -> dict:
+    """Where and under what load a line was measured."""
+    return {"cores": os.cpu_count(), "load": os.getloadavg()[0], **provenance("distributed", "jax", "numpy")}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table and writes the rows."""
     made = argparse.ArgumentParser(prog="python -m bench.sweep_costs", description=__doc__.splitlines()[0])
+    made.add_argument("--executors", nargs="+", choices=EXECUTORS, default=EXECUTORS, help="only these")
     made.add_argument("--workers", type=int, nargs="+", default=list(WORKERS), help="how many (default: 1 2 4)")
     made.add_argument("--share", type=float, default=1.0, help="of the cases, for a quick look")
     made.add_argument("--output", type=pathlib.Path, default=RESULTS, help="folder (default bench/results)")
     options = made.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
+    options.output.mkdir(parents=True, exist_ok=True)
     lines = []
-    for name in EXECUTORS:
+    for name in options.executors:
         for workers in [1] if name == "this process" else options.workers:
             with started(name, workers) as executor:
                 for kind, (work, count) in WORK.items():
                     found = measure(executor, workers, work, max(1, round(options.share * count)))
-                    lines.append({"executor": name, "workers": workers, "work": kind, **found})
-                    print("{executor:13}{workers:2}  {work:12}{ms_per_row:9.2f} ms per row".format(**lines[-1]))
-    options.output.mkdir(parents=True, exist_ok=True)
-    fields = {"cores": os.cpu_count(), "load": os.getloadavg()[0], **provenance("distributed", "jax", "numpy")}
-    pd.DataFrame([line | fields for line in lines]).round(4).to_csv(options.output / "sweep_costs.csv", index=False)
+                    lines.append({"executor": name, "workers": workers, "work": kind, **found, **_machine()})
+                    times = f"{found['ms_per_row']:9.2f} ms per row, {found['cpu_ms_here']:.2f} here"
+                    print(f"{name:13}{workers:2}  {kind:12}{times}", flush=True)
+            pd.DataFrame(lines).round(4).to_csv(options.output / "sweep_costs.csv", index=False)
     return 0
 
 

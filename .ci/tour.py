@@ -3,6 +3,7 @@
 import os
 import tempfile
 
+import distributed
 import h5py
 import jax
 import networkx
@@ -11,7 +12,7 @@ import pyarrow
 import pyarrow.parquet
 
 import jaxhom
-from jaxhom import interop, plotting
+from jaxhom import interop, plotting, sweeps
 
 jax.config.update("jax_enable_x64", True)
 
@@ -57,3 +58,16 @@ with tempfile.TemporaryDirectory() as folder:
     for name in ("rows.parquet", "steps.hdf5"):
         assert len(interop.demonstrations_from(os.path.join(folder, name), mdp=lake.mdp)[0]) == 2
     plotting.plot_policy(world, learned.policy).figure.savefig(os.path.join(folder, "policy.png"))
+
+# A sweep, by Dask.
+options = {"n_workers": 1, "dashboard_address": None}
+with (
+    tempfile.TemporaryDirectory() as folder,
+    distributed.LocalCluster(processes=False, **options) as cluster,
+    distributed.Client(cluster) as client,
+):
+    cases = [{"draw": draw} for draw in range(3)]
+    rows = sweeps.run(
+        lambda case: {"twice": 2 * case["draw"]}, cases, os.path.join(folder, "rows.jsonl"), executor=client
+    )
+assert [row["twice"] for row in rows] == [0, 2, 4]

@@ -1,15 +1,16 @@
 """Computes rows: `python -m bench.reproduce SWEEP`, of which `--help` lists the names.
 
 Rows go to `<output>/raw/*.csv` as they are computed, summaries to `<output>/*.csv` at the end. A sweep that was stopped
-goes on where it was when it is started again; `--draws` may grow in between. `python -m bench.report` turns rows into
-tables, figures and words.
+goes on where it was when it is started again; `--draws` may grow in between. `--scheduler` has the workers of a Dask
+cluster compute, in a checkout like this one. `python -m bench.report` turns rows into tables, figures and words.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 
@@ -51,11 +52,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"bench: error: {error}", file=sys.stderr)
         return 2
     try:
-        failed = sum(_run(name, work, file, options) for name, work, file in chosen)
+        with _crew(options) as crew:
+            failed = sum(_run(name, work, file, options, crew) for name, work, file in chosen)
     except KeyboardInterrupt:
         print("bench: stopped; the same command goes on from here", file=sys.stderr)
         return 130
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        print(f"bench: error: {error}", file=sys.stderr)
+        return 2
     return 1 if failed else 0
+
+
+@contextlib.contextmanager
+def _crew(options: argparse.Namespace) -> Iterator[dict]:
+    """Who computes: threads, or the cluster of a scheduler, whose workers keep their compiled programs too.
+
+    Raises:
+      OSError: if no scheduler answers.
+      ValueError: if it has no workers.
+    """
+    if options.scheduler is None:
+        yield {"workers": options.workers or 2}
+        return
+    from distributed import Client
+
+    with Client(options.scheduler) as client:
+        workers = options.workers or sum(client.nthreads().values())
+        if not workers:
+            raise ValueError(f"--scheduler {options.scheduler}: it has no workers")
+        client.run(programs.keep_programs)
+        yield {"executor": client, "workers": workers}
 
 
 def _chosen(options: argparse.Namespace) -> list[tuple[str, Sweep]]:
@@ -67,6 +93,8 @@ def _chosen(options: argparse.Namespace) -> list[tuple[str, Sweep]]:
     sweeps = SWEEPS[options.sweep]
     if options.draws is not None and options.draws < 1:
         raise ValueError(f"--draws must be at least 1, got {options.draws}")
+    if options.workers is not None and options.workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {options.workers}")
     for pattern in options.rows:
         if not any(_begins_like(setting.name, pattern) for work in sweeps.values() for setting in work.settings):
             raise ValueError(f"--rows {pattern}: no setting of {options.sweep} begins like that")
@@ -90,9 +118,9 @@ def _begins_like(name: str, pattern: str) -> bool:
     return name.split("/")[: len(parts)] == parts
 
 
-def _run(name: str, work: Sweep, file: RowFile, options: argparse.Namespace) -> int:
+def _run(name: str, work: Sweep, file: RowFile, options: argparse.Namespace, crew: dict) -> int:
     """Runs one sweep, writes its summary, and returns how many of its rows have failed."""
-    sweep.run(work, file, retry=options.retry)
+    sweep.run(work, file, retry=options.retry, **crew)
     rows = [row for row in file.read() if row.seed == options.seed]
     failed = sum(bool(row.error) for row in rows)
     summaries.write(name, rows, options.output)
@@ -109,6 +137,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--methods", nargs="+", default=[], help="only these methods")
     made.add_argument("--seed", type=int, default=0, help="of all random numbers (default 0)")
     made.add_argument("--retry", action="store_true", help="compute rows that failed once more")
+    made.add_argument("--scheduler", help="address of a Dask scheduler whose workers compute: tcp://host:8786")
+    made.add_argument("--workers", type=int, help="batches at a time (default: 2 threads, or all of a cluster)")
     made.add_argument("--output", type=pathlib.Path, default=RESULTS, help="folder (default bench/results)")
     return made
 

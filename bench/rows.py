@@ -1,16 +1,19 @@
 """Raw rows: one per setting, method and draw, in an append-only CSV file that survives being stopped anywhere.
 
 Every row carries what made it: seed, commit, versions, dtype, seconds, solver status and certificate. A batch of rows
-is written in one piece and flushed to the disk; a line that a kill cut short is dropped when the file is next opened.
-If a row is computed again, the later one counts.
+is written in one piece and flushed to the disk; a line that a kill cut short is dropped when the file is next written
+to (`jaxhom.sweeps.line_files`). If a row is computed again, the later one counts.
 """
 
 import csv
 import dataclasses
 import io
-import os
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from jaxhom.sweeps.cases import Case
+from jaxhom.sweeps.line_files import LineFile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,53 +73,63 @@ KEY = tuple(field.name for field in _FIELDS if field.default is dataclasses.MISS
 _READ = {str: str, int: int, float: float, int | None: int, float | None: float}
 
 
-class RowFile:
-    """The rows of one sweep.
+class RowFile(LineFile):
+    """The rows of one sweep, which `jaxhom.sweeps` can write to.
 
     Raises:
-      ValueError: if the file is not one of this module's.
+      ValueError: if the file is not one of this module's, or another run is writing to it.
     """
 
     def __init__(self, path: pathlib.Path):
-        self.path = pathlib.Path(path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        whole, header = _whole_lines(self.path), ",".join(COLUMNS) + "\n"
-        if not whole:
-            self.path.write_text(header)
-        elif not whole.startswith(header):
+        super().__init__(path)
+        with self.writing():
+            whole, header = self.parts()[0], ",".join(COLUMNS) + "\n"
+            if not whole:
+                self.write(header)
+
+    def check_rest(self, rest: str) -> None:
+        """Raises ValueError if the file has other columns."""
+        whole, header = self.parts()[0], ",".join(COLUMNS) + "\n"
+        if not (whole or rest).startswith(header[: len(whole or rest)]):
             raise ValueError(f"{self.path} has other columns than this version writes: move it away to start anew")
-        else:
-            os.truncate(self.path, len(whole.encode()))
 
     def append(self, rows: Iterable[Row]) -> None:
         """Writes rows in one piece, and has the disk hold them before it returns."""
+        with self.writing():
+            self._write_rows(rows)
+
+    def _write_rows(self, rows: Iterable[Row]) -> None:
         text = io.StringIO(newline="")
         writer = csv.writer(text, lineterminator="\n")
         writer.writerows([[_to_text(name, getattr(row, name)) for name in COLUMNS] for row in rows])
-        with self.path.open("a", newline="") as file:
-            file.write(text.getvalue())
-            file.flush()
-            os.fsync(file.fileno())
+        self.write(text.getvalue())
 
     def read(self) -> list[Row]:
         """The rows, the latest of each key."""
         return read_rows(self.path)
 
+    def key(self, case: Case) -> tuple:
+        """What `done` knows a case by."""
+        return tuple(case.columns[name] for name in KEY)
+
+    def done(self, retry: bool) -> set[tuple]:
+        """The cases that there is nothing more to do about."""
+        return {row.key for row in self.read() if not (retry and row.error)}
+
+    def add(self, finished: Sequence[tuple[Case, Mapping[str, Any]]]) -> None:
+        """Writes rows: cases, and what was found."""
+        known = [{**case.columns, **found} for case, found in finished]
+        self._write_rows(Row(**{name: row[name] for name in COLUMNS if row.get(name) is not None}) for row in known)
+
 
 def read_rows(path: pathlib.Path) -> list[Row]:
     """The rows of a file, the latest of each key, without changing it; a line cut short is left out."""
     rows = {}
-    for line in csv.DictReader(io.StringIO(_whole_lines(pathlib.Path(path)), newline="")):
+    for line in csv.DictReader(io.StringIO(LineFile(path).parts()[0], newline="")):
         kinds = ((field.name, _READ[field.type], field.type is str) for field in _FIELDS)
         row = Row(**{name: read(line[name]) if line[name] or is_text else None for name, read, is_text in kinds})
         rows[row.key] = row
     return list(rows.values())
-
-
-def _whole_lines(path: pathlib.Path) -> str:
-    """What a file holds up to its last line break."""
-    text = path.read_bytes().decode() if path.exists() else ""
-    return text[: text.rfind("\n") + 1]
 
 
 def _to_text(name: str, value) -> str:

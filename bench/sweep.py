@@ -1,4 +1,4 @@
-"""Runs settings x methods x draws, appends rows, and goes on where it was stopped.
+"""Runs settings x methods x draws by `jaxhom.sweeps`, which appends rows and goes on where it was stopped.
 
 The draws of a setting go through the solvers in batches of one size, so that few shapes are compiled. A batch that
 fails is tried draw by draw; a draw that fails is a row with its error, and the sweep goes on.
@@ -6,30 +6,29 @@ fails is tried draw by draw; a draw that fails is a row with its error, and the 
 
 import contextlib
 import dataclasses
-import sys
 import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+import weakref
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 import jaxhom
 from bench.methods import Method
 from bench.problems import Problem, draw_problem
-from bench.provenance import provenance
-from bench.rows import KEY, Row, RowFile
+from bench.rows import KEY, RowFile
 from bench.settings import Setting
 from jaxhom import Status
+from jaxhom.sweeps import runs
+from jaxhom.sweeps.cases import checked_jobs
 
 BATCH = 50  # draws: all of a point of Figure 1, and half of a row of Table I
 _NUM_TRIALS = 1000  # as many as the paper's
-_BY_LAPACK = threading.Lock()  # small models are solved by LAPACK inside XLA: two such programs at a time can hang
 _SMALL = 64  # states
-_BAR = "{desc}{percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
+_OF_SETTING = KEY[: KEY.index("method")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,101 +49,76 @@ class Sweep:
     seed: int = 0
 
 
-@dataclasses.dataclass(frozen=True)
-class _Task:
-    """A batch of draws of one setting, and per method the rows (without numbers) that are missing."""
-
-    setting: Setting
-    draws: tuple[int, ...]
-    missing: dict[str, list[Row]]
-
-    @property
-    def work(self) -> int:
-        """A rough measure of a method's cost: states times missing draws, the compiler's share included."""
-        return (self.num_states + 500) * len(self.draws)
-
-    @property
-    def num_states(self) -> int:
-        """About: of grids and lakes their size says it."""
-        size = self.setting.domain.lstrip("abcdefghijklmnopqrstuvwxyz_")
-        return int(size) ** 2 if size else 5000
-
-
-def run(sweep: Sweep, file: RowFile, *, retry: bool = False, workers: int = 2) -> None:
+def run(sweep: Sweep, file: RowFile, *, retry: bool = False, executor: Any = None, workers: int = 2) -> None:
     """Computes the rows that `file` does not hold yet.
 
     Args:
       sweep: what to compute.
       file: where rows are read from and appended to.
       retry: compute rows that failed once more.
-      workers: batches worked on at a time, by threads: the solvers on the host use one core each.
+      executor: who computes, as `jaxhom.sweeps` takes it; threads if None: the solvers on the host use one core each.
+      workers: how many that are.
 
     Raises:
       KeyboardInterrupt: if the user stops it, once the methods in progress are done and their rows written.
+      RuntimeError: if the executor gave up.
     """
-    tasks = _tasks(sweep, done={row.key for row in file.read() if not (retry and row.error)})
-    is_stopped, lock = threading.Event(), threading.Lock()
-
-    def work(task: _Task) -> None:
-        for rows in _compute(sweep, task):
-            with lock:
-                file.append(rows)
-                bar.set_description(task.setting.name, refresh=False)
-                bar.update(task.work)
-            if is_stopped.is_set():
-                return
-
-    total = sum(task.work * len(task.missing) for task in tasks)
-    with (
-        tqdm(total=total, bar_format=_BAR, mininterval=1.0, smoothing=0.05) as bar,
-        ThreadPoolExecutor(workers) as pool,
-    ):
-        futures = [pool.submit(work, task) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                future.result()
-        except BaseException:
-            is_stopped.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            bar.write("stopping as soon as the methods in progress are done", file=sys.stderr)
-            raise
+    work = Work(sweep)
+    with ThreadPoolExecutor(workers) if executor is None else contextlib.nullcontext(executor) as crew:
+        options = {"executor": crew, "retry": retry, "group": _group, "in_flight": workers}
+        runs.run_jobs(work, checked_jobs(work.batches()), file, **options)
 
 
-def _tasks(sweep: Sweep, done: set) -> list[_Task]:
-    """What is missing. All first batches come before the second ones, which find everything compiled."""
-    tasks = []
-    for first in range(0, sweep.draws, BATCH):
-        draws = tuple(range(first, min(first + BATCH, sweep.draws)))
-        for setting in sweep.settings:
-            shared = {name: getattr(setting, name) for name in KEY if hasattr(setting, name)} | {"seed": sweep.seed}
-            blanks = {name: [Row(**shared, method=name, draw=draw) for draw in draws] for name in sweep.methods}
-            missing = {name: [row for row in rows if row.key not in done] for name, rows in blanks.items()}
-            tasks.append(_Task(setting, draws, {name: rows for name, rows in missing.items() if rows}))
-    return [task for task in tasks if task.missing]
+def _group(case: dict) -> tuple:
+    """What goes one after another: the methods of a batch of draws, which share problems; and all small models.
+
+    Those are solved by LAPACK inside XLA, and two such programs at a time in one process can hang.
+    """
+    size = case["domain"].lstrip("abcdefghijklmnopqrstuvwxyz_")
+    if size and int(size) ** 2 <= _SMALL:
+        return ("small",)
+    return (*(case[name] for name in _OF_SETTING), case["draw"] // BATCH)
 
 
-def _compute(sweep: Sweep, task: _Task) -> Iterator[list[Row]]:
-    """The missing rows of a task, method by method. A batch is computed whole: its shapes are compiled already."""
-    problems: dict[tuple[int, ...], Problem] = {}
+class Work:
+    """A method on a batch of draws, for `jaxhom.sweeps`. A case is the key of a row."""
 
-    def results(method: Method, draws: tuple[int, ...]) -> list[dict]:
-        """Per draw, the numbers of a row or its error; if the batch fails, draw by draw."""
-        try:
-            if draws not in problems:
-                problems[draws] = draw_problem(task.setting, draws, sweep.seed)
-            return _results(problems[draws], method, sweep.sampled)
-        except Exception as error:  # of whichever draw: it alone is to have no numbers
-            if len(draws) == 1:
-                return [{"error": f"{type(error).__name__}: {error}"[:300], "batch": 1}]
-            return [result for draw in draws for result in results(method, (draw,))]
+    def __init__(self, sweep: Sweep):
+        self.sweep = sweep
+        self._settings = {_of_setting(dataclasses.asdict(setting)): setting for setting in sweep.settings}
 
-    for name, blanks in task.missing.items():
-        with _BY_LAPACK if task.num_states <= _SMALL else contextlib.nullcontext():
-            start = time.perf_counter()
-            found = dict(zip(task.draws, results(sweep.methods[name], task.draws), strict=True))
-        shared = {"seconds": (time.perf_counter() - start) / len(task.draws)}
-        shared |= provenance("jax", "jaxlib", "numpy", "scipy")
-        yield [dataclasses.replace(blank, **found[blank.draw], **shared) for blank in blanks]
+    def batches(self) -> list[list[dict]]:
+        """All cases. First batches come before second ones, which find everything compiled."""
+        sweep = self.sweep
+        firsts = range(0, sweep.draws, BATCH)
+        return [
+            [{**shared, "method": method, "draw": draw, "seed": sweep.seed} for draw in draws]
+            for draws in (range(first, min(first + BATCH, sweep.draws)) for first in firsts)
+            for shared in (dict(zip(_OF_SETTING, of_setting, strict=True)) for of_setting in self._settings)
+            for method in sweep.methods
+        ]
+
+    def __call__(self, cases: list[dict]) -> list[dict]:
+        """The numbers of a row for each case of a batch."""
+        draws = tuple(case["draw"] for case in cases)
+        problem = _problem(self._settings[_of_setting(cases[0])], draws, self.sweep.seed)
+        return _results(problem, self.sweep.methods[cases[0]["method"]], self.sweep.sampled)
+
+
+def _of_setting(columns: dict) -> tuple:
+    return tuple(columns[name] for name in _OF_SETTING)
+
+
+_alive: weakref.WeakValueDictionary[tuple, Problem] = weakref.WeakValueDictionary()
+_mine = threading.local()
+
+
+def _problem(setting: Setting, draws: tuple[int, ...], seed: int) -> Problem:
+    """That of the method before, mostly: problems live as long as they are the last one of a thread."""
+    key = (setting, draws, seed)
+    _mine.problem = problem = _alive.get(key) or draw_problem(*key)
+    _alive[key] = problem
+    return problem
 
 
 def _results(problem: Problem, method: Method, sampled: bool) -> list[dict]:

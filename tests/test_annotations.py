@@ -9,9 +9,9 @@ import inspect
 import pytest
 
 import jaxhom
-from jaxhom import interop, plotting
+from jaxhom import interop, plotting, sweeps
 
-DOORS = (jaxhom, interop, plotting)
+DOORS = (jaxhom, interop, plotting, sweeps)
 
 
 def public_functions():

@@ -9,7 +9,7 @@ import pytest
 from doc_pages import DOCS, PAGES, README, ROOT, blocks_of, differences, pictures_of, prose_of, run_step, steps_of
 
 import jaxhom
-from jaxhom import interop, plotting
+from jaxhom import interop, plotting, sweeps
 
 matplotlib.use("Agg")
 
@@ -95,7 +95,7 @@ def test_the_reference_names_what_exists(name):
     assert named(name).__doc__
 
 
-@pytest.mark.parametrize("module", [jaxhom, interop, plotting], ids=lambda module: module.__name__)
+@pytest.mark.parametrize("module", [jaxhom, interop, plotting, sweeps], ids=lambda module: module.__name__)
 def test_public_names_are_in_the_reference(module):
     assert len({*jaxhom.__all__} - {"maximum_entropy"}) <= 58  # but for the former name of another
     listed = [named(name) for name in DIRECTIVES]

@@ -293,6 +293,7 @@ def test_settings_and_methods_of_the_shipped_experiments(name):
     ("options", "message"),
     [
         (["--draws", "0"], "--draws must be at least 1"),
+        (["--workers", "0"], "--workers must be at least 1"),
         (["--rows", "grid17"], "--rows grid17: no setting of table1"),
         (["--rows", "grid1"], "--rows grid1: no setting of table1"),
         (["--methods", "oracle"], "--methods oracle: not one of"),

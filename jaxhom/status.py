@@ -109,7 +109,10 @@ def _register_without(cls: type, data: list[str], static: list[str]) -> None:
     def unflatten(values, children):
         return cls(**dict(zip(data, children, strict=True)), **dict(zip(static, values, strict=True)))
 
-    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+    def flatten_at_once(record):  # what every call of a jitted function does
+        return [getattr(record, name) for name in data], tuple(getattr(record, name) for name in static)
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten, flatten_at_once)
 
 
 def summary(name: str, figures: Mapping[str, Any]) -> str:

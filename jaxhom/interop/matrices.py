@@ -68,8 +68,8 @@ def from_mdptoolbox(
     checks.require_shape("transitions", array, "[A, S, S] with A, S >= 1", good)
     rows = None if allowed is None else _flags(allowed, array.shape[1], len(array))
     array = checks.require_distribution("transitions", array, None if rows is None else rows.T)
-    options = {"initial": initial, "features": features, "allowed": rows}
-    return MDP.from_dense(np.moveaxis(array, 0, 1), discount=discount, **options)
+    dense = np.moveaxis(array, 0, 1)
+    return MDP.from_dense(dense, discount=discount, initial=initial, features=features, allowed=rows)
 
 
 def _is_sequence(transitions) -> TypeGuard[Sequence[Any]]:

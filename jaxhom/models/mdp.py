@@ -11,6 +11,8 @@ and its features are zero, and no policy may take it.
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -21,16 +23,18 @@ from jaxhom import checks
 from jaxhom.models import construction
 from jaxhom.models.dense_tensor import DenseTensor
 from jaxhom.models.dynamics import Dynamics
+from jaxhom.models.exploration import explore, features_of, padded
+from jaxhom.models.names import Names, check_names, look_up, numbers_of
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-_REPLACEABLE = ("discount", "initial", "features", "probability", "allowed")
+_REPLACEABLE = ("discount", "initial", "features", "probability", "allowed", "state_names", "action_names")
 
 
 class MDP(Record):
-    """A finite MDP without reward. Build it with `MDP.from_dense` or `MDP.from_successors`.
+    """A finite MDP without reward. Build it with `MDP.from_dense`, `MDP.from_successors` or `MDP.from_function`.
 
     Attributes:
       dynamics: the transitions in the layout that was chosen for them, with the one-step maps.
@@ -39,6 +43,8 @@ class MDP(Record):
       discount: float scalar, strictly between 0 and 1.
       allowed: bool [S, A], the actions that exist in each state, one at least.
       restricts_actions: whether some state lacks some action.
+      state_names: S hashable values, or None: what the states are called, in messages, explanations and files.
+      action_names: A of them, or None. Models that come out of `jit`, `vmap`, `grad` and `jax.tree.map` have no names.
     """
 
     dynamics: Dynamics
@@ -47,6 +53,8 @@ class MDP(Record):
     discount: Float[Array, ""]
     allowed: Bool[Array, "S A"]
     restricts_actions: bool = dataclasses.field(metadata={"static": True})
+    state_names: Names | None = dataclasses.field(default=None, metadata={"dropped": True})
+    action_names: Names | None = dataclasses.field(default=None, metadata={"dropped": True})
 
     @classmethod
     def from_dense(
@@ -57,6 +65,8 @@ class MDP(Record):
         initial: Float[ArrayLike, " S"] | None = None,
         features: Float[ArrayLike, "S A K"] | Float[ArrayLike, "S K"] | None = None,
         allowed: Bool[ArrayLike, "S A"] | None = None,
+        state_names: Iterable[Hashable] | None = None,
+        action_names: Iterable[Hashable] | None = None,
     ) -> MDP:
         """Builds a model from its transition tensor. On the host: not under `jit`, `vmap` or `grad`.
 
@@ -68,13 +78,16 @@ class MDP(Record):
           features: [S, A, K], or [S, K] for features of the state alone; no features (K = 0) if None.
           allowed: bool [S, A], which actions exist in each state, one at least; all if None. What the other pairs have
             in `transition` and `features` is not looked at.
+          state_names: S hashable values, all different; none if None.
+          action_names: A of them; none if None.
 
         Returns:
           The model, in the dtype of `transition` (integers become floats).
 
         Raises:
           ValueError: on a wrong shape, on more than 2^31 - 2 entries, naming the first entry that is NaN, negative
-            or out of range, the first row that does not sum to 1, or the first state without an action.
+            or out of range, the first row that does not sum to 1, the first state without an action, or the first name
+            that is not new.
 
         Example:
           >>> mdp = MDP.from_dense([[[0.5, 0.5], [1, 0]], [[0, 1], [0, 1]]], discount=0.9, initial=[1, 0])
@@ -82,7 +95,7 @@ class MDP(Record):
           (2, 2, 0)
         """
         lists = construction.lists_of_tensor(transition, allowed)
-        return cls._assemble(*lists, discount, initial, features)
+        return cls._assemble(*lists, discount, initial, features, state_names, action_names)
 
     @classmethod
     def from_successors(
@@ -94,6 +107,8 @@ class MDP(Record):
         initial: Float[ArrayLike, " S"] | None = None,
         features: Float[ArrayLike, "S A K"] | Float[ArrayLike, "S K"] | None = None,
         allowed: Bool[ArrayLike, "S A"] | None = None,
+        state_names: Iterable[Hashable] | None = None,
+        action_names: Iterable[Hashable] | None = None,
     ) -> MDP:
         """Builds a model from lists of successors, without ever making the dense tensor of a sparse model.
 
@@ -106,6 +121,8 @@ class MDP(Record):
           initial: [S] distribution of the first state; uniform if None.
           features: [S, A, K] or [S, K]; no features (K = 0) if None.
           allowed: bool [S, A], as in `from_dense`.
+          state_names: S names, as in `from_dense`.
+          action_names: A of them.
 
         Returns:
           The model, in the dtype of `probability`.
@@ -119,10 +136,63 @@ class MDP(Record):
           [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
         """
         lists = construction.lists_of_successors(next_state, probability, allowed)
-        return cls._assemble(*lists, discount, initial, features)
+        return cls._assemble(*lists, discount, initial, features, state_names, action_names)
 
     @classmethod
-    def _assemble(cls, next_state, probability, allowed, discount, initial, features) -> MDP:
+    def from_function(
+        cls,
+        successors: Callable[[Any], Mapping[Hashable, Iterable[tuple[float, Hashable]]] | None],
+        start: Hashable | Mapping[Hashable, float],
+        *,
+        discount: Float[ArrayLike, ""],
+        features: Callable[[Any, Any], Sequence[float]] | None = None,
+        actions: Iterable[Hashable] | None = None,
+        max_states: int = 1_000_000,
+        progress: bool = False,
+    ) -> MDP:
+        """Builds a model of all states that a function leads to, explored breadth first.
+
+        On the host: not under `jit`, `vmap` or `grad`.
+
+        Args:
+          successors: takes a state, any hashable value, and returns a mapping from the actions that exist there
+            (hashable values too) to lists of pairs (probability, next state), whose probabilities sum to 1. A state
+            where nothing can be done (None, or an empty mapping) ends an episode: it is absorbing, with all actions.
+          start: the state where episodes start, or a mapping from states to probabilities.
+          discount: scalar, strictly between 0 and 1.
+          features: takes a state and an action that exists there, and returns K numbers; no features (K = 0) if None.
+            Where an episode has ended they are 0.
+          actions: A of them, in the order in which they are to be numbered; as they are met if None.
+          max_states: more than so many are refused.
+          progress: show how many states have been explored.
+
+        Returns:
+          The model, in float64 (float32 unless x64 is on). `state_names` and `action_names` are the states and actions,
+          numbered as they were met.
+
+        Raises:
+          ValueError: naming the state and action whose outcomes are malformed or do not sum to 1; if there are too many
+            states, or no actions; and as `from_dense`. What the functions raise themselves is passed on, with a note
+            that names the state.
+
+        Example:
+          >>> def successors(place):  # a corridor of four places, with a slippery floor
+          ...     go = [(0.8, place + 1), (0.2, place)]
+          ...     return None if place == 3 else {"wait": [(1.0, place)], "go": go}
+          >>> mdp = MDP.from_function(successors, 0, discount=0.9, features=lambda place, action: [action == "go"])
+          >>> mdp.state_names, mdp.action_names, mdp.features[..., 0].tolist()
+          ((0, 1, 2, 3), ('wait', 'go'), [[0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
+          >>> mdp.transition[mdp.state_index(2), mdp.action_index("go")].tolist()
+          [0.0, 0.0, 0.2, 0.8]
+        """
+        found = explore(successors, start, actions, max_states, progress)
+        next_state, probability = padded(found)
+        lists = construction.lists_of_successors(next_state, probability, found.allowed)
+        table = None if features is None else features_of(features, found)
+        return cls._assemble(*lists, discount, found.initial, table, found.states, found.actions)
+
+    @classmethod
+    def _assemble(cls, next_state, probability, allowed, discount, initial, features, state_names, action_names) -> MDP:
         dtype = checks.to_device(probability[:1, :1]).dtype  # float64 becomes float32 unless x64 is on
         initial = construction.check_initial(initial, len(next_state))
         features = construction.check_features(features, allowed, dtype)
@@ -135,7 +205,37 @@ class MDP(Record):
             discount=checks.to_device(discount, dtype),
             allowed=checks.to_device(allowed),
             restricts_actions=not allowed.all(),
+            state_names=check_names("state_names", state_names, len(allowed)),
+            action_names=check_names("action_names", action_names, allowed.shape[1]),
         )
+
+    def state_index(self, name: Hashable) -> int:
+        """The number of the state with a name.
+
+        Raises:
+          ValueError: if there is none, naming those that look most like it; or if the states have no names.
+
+        Example:
+          >>> MDP.from_dense([[[0, 1]], [[0, 1]]], discount=0.9, state_names=["door", "room"]).state_index("room")
+          1
+        """
+        return look_up("state", self._state_numbers, name)
+
+    def action_index(self, name: Hashable) -> int:
+        """The number of the action with a name.
+
+        Raises:
+          ValueError: as `state_index`.
+        """
+        return look_up("action", self._action_numbers, name)
+
+    @functools.cached_property
+    def _state_numbers(self) -> dict[Hashable, int] | None:
+        return None if self.state_names is None else numbers_of("state_names", self.state_names)
+
+    @functools.cached_property
+    def _action_numbers(self) -> dict[Hashable, int] | None:
+        return None if self.action_names is None else numbers_of("action_names", self.action_names)
 
     def replace(self, **changes: Any) -> MDP:
         """Returns the model with the given arrays exchanged; usable under `jit`, `vmap` and `grad`.
@@ -146,7 +246,7 @@ class MDP(Record):
         Args:
           **changes: `discount`, `initial`, `features` ([S, A, K] or [S, K]), `probability` in the layout that the model
             has, without a successor that was not there: successors are not searched for again; `allowed`, which may
-            only take actions away.
+            only take actions away; `state_names`, `action_names`.
 
         Raises:
           ValueError: if another field is named, or a concrete array is not what the constructors would take.
@@ -288,8 +388,10 @@ def uniform_policy(mdp: MDP) -> Float[Array, "S A"]:
     return allowed / allowed.sum(axis=-1, keepdims=True)
 
 
-def _replacement(mdp: MDP, name: str, new) -> jax.Array:
+def _replacement(mdp: MDP, name: str, new) -> jax.Array | Names | None:
     """What `MDP.replace` puts in the place of a field; checked as far as it is concrete."""
+    if name in ("state_names", "action_names"):
+        return check_names(name, new, mdp.num_states if name == "state_names" else mdp.num_actions)
     old = getattr(mdp, name)
     if checks.is_traced(new, mdp):
         if name == "features" and jnp.ndim(new) == 2 and jnp.shape(new)[0] == mdp.num_states:

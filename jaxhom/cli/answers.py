@@ -41,6 +41,7 @@ class Answers:
     def __init__(self, problem: Problem, path: str | None, output: Results):
         self._problem, self._path, self._output = problem, path, output
         self._names = action_names(problem)
+        self._by_text = {name.lower(): number for number, name in reversed([*enumerate(self._names)])}
         self._expert = np.argmax(problem.plan.policy, axis=1) if path is None else None
         self._states: list[int] = []
         self._actions: list[int] = []
@@ -96,7 +97,7 @@ class Answers:
                 self.is_over = True
             if not text or self.is_over:
                 return None
-            number = self._names.index(text) if text in self._names else _number(text)
+            number = self._by_text.get(text, _number(text))
             if number in allowed:
                 return number
             complaint = f"state {state}: {text!r} is no action that is allowed there"

@@ -58,7 +58,8 @@ def draw_policy(
     """A figure of a policy [S, A]; on racetracks that of cars of one speed."""
     plotting = load_plotting()
     if problem.domain is None:
-        return plotting.plot_policy_by_state(policy, visited=visited).figure
+        names = {"state_names": problem.mdp.state_names, "action_names": problem.mdp.action_names}
+        return plotting.plot_policy_by_state(policy, visited=visited, **names).figure
     ax = plotting.plot_policy(problem.domain, policy, speed=speed)
     if isinstance(problem.domain, Racetrack):
         ax.set_title(f"cars of speed ({speed[0]}, {speed[1]})", loc="left", fontsize="medium")
@@ -70,7 +71,7 @@ def draw_occupancy(problem: Problem, policy: Any) -> Figure:
     plotting = load_plotting()
     visits = occupancy(problem.mdp, policy)
     if problem.domain is None:
-        return plotting.plot_occupancy_by_state(visits).figure
+        return plotting.plot_occupancy_by_state(visits, state_names=problem.mdp.state_names).figure
     return plotting.plot_occupancy(problem.domain, visits).figure
 
 
@@ -78,7 +79,7 @@ def draw_trajectories(problem: Problem, demonstrations: Demonstrations) -> Figur
     """A figure of demonstrations."""
     plotting = load_plotting()
     if problem.domain is None:
-        return plotting.plot_trajectories_by_state(demonstrations).figure
+        return plotting.plot_trajectories_by_state(demonstrations, state_names=problem.mdp.state_names).figure
     return plotting.plot_trajectories(problem.domain, demonstrations).figure
 
 

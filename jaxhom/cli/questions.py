@@ -6,7 +6,7 @@ import string
 
 import numpy as np
 
-from jaxhom.cli.sources import Problem
+from jaxhom.cli.sources import Problem, plain_text
 from jaxhom.cli.tables import format_table
 from jaxhom.domains.racetrack import ACTIONS as RACETRACK_ACTIONS
 from jaxhom.domains.racetrack import Racetrack
@@ -38,7 +38,9 @@ def mark(number: int) -> str:
 
 
 def name_of(problem: Problem, state: int) -> str:
-    """A state's number, and on maps its place, as `Problem.state_of` takes either."""
+    """A state's number, and its name or on maps its place, as `Problem.state_of` takes either."""
+    if problem.mdp.state_names is not None:
+        return f"{state} {plain_text(problem.mdp.state_names[state])}"
     if problem.domain is None or problem.coordinates is None:
         return str(state)
     place = [*problem.coordinates[state]]
@@ -48,7 +50,9 @@ def name_of(problem: Problem, state: int) -> str:
 
 
 def action_names(problem: Problem) -> list[str]:
-    """What the actions are called; their numbers where there is no map to say more."""
+    """What the actions are called; their numbers where neither the model nor a map says more."""
+    if problem.mdp.action_names is not None:
+        return [plain_text(name) for name in problem.mdp.action_names]
     numbers = [str(action) for action in range(problem.mdp.num_actions)]
     if problem.domain is None:
         return numbers

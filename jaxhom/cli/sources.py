@@ -12,6 +12,7 @@ import functools
 import os
 import sys
 import warnings
+from collections.abc import Hashable
 from typing import Any
 
 import jax
@@ -33,6 +34,7 @@ from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.models.impossible_steps import ImpossibleStepsWarning
 from jaxhom.models.inputs import check_coordinates, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
+from jaxhom.models.names import look_up
 from jaxhom.planning.optimal import Plan, optimal_policy
 from jaxhom.similarity.table import SimilarityTable
 
@@ -124,9 +126,17 @@ class Problem:
     def state_of(self, text: str) -> int:
         """The state that a user means: `12`, on maps `row,column`, on racetracks `row,column,down,right` with a speed.
 
+        Of models whose states have names it is a name, tuples without parentheses, or else a number.
+
         Raises:
           ValueError: if there is no such state.
         """
+        if self.mdp.state_names is not None:
+            by_text: dict[Hashable, int] = {
+                plain_text(name): number for number, name in enumerate(self.mdp.state_names)
+            }
+            if text in by_text or not text.isdigit():
+                return look_up("state", by_text, text)
         try:
             numbers = [int(part) for part in text.split(",")]
         except ValueError:
@@ -140,6 +150,11 @@ class Problem:
         if self.domain is not None and len(numbers) == 2:
             return self.domain.state_of(numbers)
         raise ValueError(f"state {text!r}: {self.name} numbers its states from 0 to {self.mdp.num_states - 1}")
+
+
+def plain_text(name: Hashable) -> str:
+    """A name as people type it: tuples without parentheses and blanks."""
+    return ",".join(map(str, name)) if isinstance(name, tuple) else str(name)
 
 
 def load_problem(options: argparse.Namespace) -> Problem:

@@ -92,6 +92,8 @@ def occupancy_regression(
         undecided=checks.to_device(np.zeros_like(visited), jnp.int32),
         status=checks.to_device(np.asarray(Status.SOLVED), jnp.int32),
         explainer=ByOccupancy(x, int(decides.sum())),
+        state_names=mdp.state_names,
+        action_names=mdp.action_names,
     )
 
 

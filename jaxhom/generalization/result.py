@@ -12,6 +12,7 @@ from jaxhom.generalization.explainers import demonstrated
 from jaxhom.generalization.explanation import Explanation
 from jaxhom.generalization.votes import Votes
 from jaxhom.models.mdp import MDP
+from jaxhom.models.names import Names
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ class Generalization(Record):
       error_upper: scalar, likewise.
       explainer: what the method remembers to explain itself, called with the generalization and a state. No part of
         the pytree: whatever comes out of `jax.tree.map`, `jit` or `vmap` has forgotten it.
+      state_names: what the model calls its states, for explanations, and action_names its actions; None without names.
+        No part of the pytree, likewise.
     """
 
     policy: Float[Array, "S A"]
@@ -49,6 +52,8 @@ class Generalization(Record):
     explainer: Callable[[Generalization, int], Explanation] | None = dataclasses.field(
         default=None, metadata={"dropped": True}
     )
+    state_names: Names | None = dataclasses.field(default=None, metadata={"dropped": True})
+    action_names: Names | None = dataclasses.field(default=None, metadata={"dropped": True})
 
     @checks.eager_where_concrete
     def explain(self, state: Int[ArrayLike, ""]) -> Explanation:
@@ -76,7 +81,8 @@ class Generalization(Record):
         number = checks.as_host_array("state", state)
         checks.require_shape("state", number, "(), one state", number.ndim == 0)
         number = int(checks.require_integers("state", number, upper=len(self.visited)))
-        return (demonstrated if self.visited[number] else self.explainer)(self, number)
+        found = (demonstrated if self.visited[number] else self.explainer)(self, number)
+        return found.replace(state_names=self.state_names, action_names=self.action_names)
 
 
 def extend(mdp: MDP, start: Generalization, votes: Votes, explainer, **more) -> Generalization:

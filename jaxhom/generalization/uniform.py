@@ -53,6 +53,8 @@ def uniform_elsewhere(mdp: MDP, demonstrations: Demonstrations) -> Generalizatio
         undecided=checks.to_device(xp.zeros_like(support)),
         status=checks.to_device(Status.SOLVED, np.int32),
         explainer=None if checks.is_traced(visited) else nothing_is_looked_for,
+        state_names=mdp.state_names,
+        action_names=mdp.action_names,
     )
 
 

@@ -15,6 +15,7 @@ Everything is computed on the host in float64, whatever the model's type, and ro
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -28,6 +29,7 @@ from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_policy, require_features
 from jaxhom.models.mdp import MDP, deciding_states
+from jaxhom.models.names import Names, described
 from jaxhom.solvers.blas_threads import one_blas_thread
 from jaxhom.status import Record, Status
 
@@ -60,6 +62,7 @@ class LossBound(Record):
       agreed: bool [S], the states S^E in which the expert is known: demonstrated, and something was to be decided.
       weights: [K], as given; None if none were.
       status: int32 scalar, a `jaxhom.Status`: SOLVED where every feature's optimum was found, and the policy's values.
+      state_names: what the model calls its states; None without names, and after JAX transformations.
     """
 
     bound: Float[Array, "*B"]
@@ -71,6 +74,7 @@ class LossBound(Record):
     agreed: Bool[Array, "*B S"]
     weights: Float[Array, "*B K"] | None = None
     status: Int[Array, "*B"]
+    state_names: Names | None = dataclasses.field(default=None, metadata={"dropped": True})
 
     def __str__(self) -> str:
         try:
@@ -206,6 +210,7 @@ class Agreeing:
             worst=checks.to_device(worst, np.int32),
             agreed=checks.to_device(self.agreed),
             status=checks.to_device(self.status if self.status != Status.SOLVED else own.status, np.int32),
+            state_names=self._mdp.state_names,
         )
 
     def _plan(self, choices: Choices) -> Found:
@@ -245,7 +250,7 @@ def _in_words(loss: LossBound) -> str:
     given = "for weights of sum 1" if loss.weights is None else "for the given weights"
     best, own = float(loss.optima[worst]), float(loss.expectations[worst])
     most = [int(s) for s in np.argsort(-parts, kind="stable")[:_SHOWN] if parts[s] > 0]
-    names = ", ".join(f"{s} ({parts[s]:.4g})" for s in most) or "none"
+    names = ", ".join(f"{described(s, loss.state_names)} ({parts[s]:.4g})" for s in most) or "none"
     return "\n".join(
         [
             f"at most {float(loss.bound):.6g} is lost against the expert, {given}",

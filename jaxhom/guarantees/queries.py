@@ -29,6 +29,7 @@ from jaxhom.guarantees.loss_bound import loss_bound
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
+from jaxhom.models.names import Names, described
 from jaxhom.models.trajectories import require_flags
 from jaxhom.planning.host_chains import host_model
 from jaxhom.planning.occupancy import has_occupancy, occupancy, policy_value
@@ -54,6 +55,7 @@ class Queries(Record):
         it is elsewhere. The same for every reward features @ w, w >= 0 of sum 1. None if the model has no features.
       criterion: what they were ranked by.
       status: int32 scalar, a `jaxhom.Status`: that of the bound, None for other criteria.
+      state_names: what the model calls its states; None without names, and after JAX transformations.
     """
 
     states: Int[Array, " count"]
@@ -61,6 +63,7 @@ class Queries(Record):
     changes: Float[Array, " count"] | None = None
     criterion: str = dataclasses.field(metadata={"static": True})
     status: Int[Array, ""] | None = None
+    state_names: Names | None = dataclasses.field(default=None, metadata={"dropped": True})
 
     def __str__(self) -> str:
         try:
@@ -152,6 +155,7 @@ def _ranked(mdp: MDP, demonstrations, policy, count: int, criterion: str, termin
         changes=None if changes is None else checks.to_device(changes, mdp.dtype),
         criterion=criterion,
         status=status,
+        state_names=mdp.state_names,
     )
 
 
@@ -253,5 +257,5 @@ def _in_words(queries: Queries) -> str:
     lines = [f"states to ask about, by {queries.criterion}"]
     for i, (state, score) in enumerate(zip(states, scores, strict=True)):
         change = "" if queries.changes is None else f", changes a feature's value by up to {queries.changes[i]:.4g}"
-        lines.append(f"  state {state}: score {score:.4g}{change}")
+        lines.append(f"  state {described(state, queries.state_names)}: score {score:.4g}{change}")
     return "\n".join(lines)

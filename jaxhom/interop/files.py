@@ -7,6 +7,8 @@
                     initial           [S], optional: uniform if missing
                     features          [S, A, K] or [S, K], optional
                     allowed           bool [S, A], optional: the actions that exist
+                    state_names       texts [S], or integers [S] or [S, D], optional: see `name_arrays`
+                    action_names      likewise, of actions
     beside a model  reward            [S, A] or [S]                                   all optional,
                     coordinates       [S, D], positions of the states                 read by the
                     terminal          bool [S], where episodes end                    command line
@@ -32,6 +34,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.interop.name_arrays import names_as_array, names_of
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
 from jaxhom.models.trajectories import require_flags
@@ -68,13 +71,14 @@ def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None =
       2
     """
     arrays = _read(path)
-    options = {name: arrays[name] for name in ("initial", "features", "allowed") if name in arrays}
+    options: dict[str, Any] = {name: arrays[name] for name in ("initial", "features", "allowed") if name in arrays}
     if discount is not None:
         if "discount" in arrays:
             raise FileError(f"{path}: it has a discount of its own, {checks.in_one_line(arrays['discount'].tolist())}")
         arrays["discount"] = np.asarray(discount)
     _require(path, arrays, "discount")
     try:
+        options |= {name: names_of(name, arrays[name]) for name in ("state_names", "action_names") if name in arrays}
         if "transition" in arrays:
             return MDP.from_dense(arrays["transition"], discount=arrays["discount"], **options)
         if "next_state" not in arrays and "probability" not in arrays:
@@ -171,6 +175,8 @@ def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
 def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
     """Writes a model, in the layout it has; `load_mdp` gives it back bit by bit.
 
+    Names that Python writes as literals (texts, numbers, tuples of them) come back as they are, others as their texts.
+
     Raises:
       OSError: if the file cannot be written.
 
@@ -185,7 +191,8 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
     """
     layout = {"transition": np.asarray(mdp.probability)} if mdp.is_dense else _fields(mdp, "next_state", "probability")
     allowed = _fields(mdp, "allowed") if mdp.restricts_actions else {}
-    _write(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed})
+    names = {name: names_as_array(getattr(mdp, name)) for name in ("state_names", "action_names") if mdp[name]}
+    _write(path, {**layout, **_fields(mdp, "initial", "features", "discount"), **allowed, **names})
 
 
 def save_demonstrations(path: str | os.PathLike, demonstrations: Demonstrations) -> None:

@@ -6,7 +6,7 @@ states of one model (local models, global maps, coordinates) compares states of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -81,6 +81,7 @@ def disjoint_union(models: Iterable[MDP]) -> DisjointUnion:
     Returns:
       `DisjointUnion`: its `mdp` has the states of all parts, part after part, their transitions, features and allowed
       actions, and starts in each part with probability 1/M. Its layout is chosen anew, as by `MDP.from_successors`.
+      Where all parts' states have names, those of the union are pairs (part, name); actions keep names that all share.
 
     Raises:
       ValueError: if there is no model, or naming the first one that does not fit, and in what, or is traced.
@@ -111,6 +112,8 @@ def disjoint_union(models: Iterable[MDP]) -> DisjointUnion:
         initial=np.concatenate([np.asarray(part.initial) / len(parts) for part in parts]),
         features=np.concatenate([np.asarray(part.features) for part in parts]),
         allowed=np.concatenate([np.asarray(part.allowed) for part in parts]),
+        state_names=_state_names(parts),
+        action_names=parts[0].action_names if len({part.action_names for part in parts}) == 1 else None,
     )
     return DisjointUnion(mdp=mdp, offsets=checks.to_device(offsets, jnp.int32))
 
@@ -122,6 +125,12 @@ def _traits(mdp: MDP) -> dict[str, Any]:
         "dtype": str(mdp.dtype),
         "discount": float(mdp.discount),
     }
+
+
+def _state_names(parts: list[MDP]) -> list[tuple[int, Hashable]] | None:
+    if any(part.state_names is None for part in parts):
+        return None
+    return [(number, name) for number, part in enumerate(parts) for name in part.state_names]
 
 
 def _lists(mdp: MDP) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jaxhom.models.mdp import MDP
+from jaxhom.models.names import described
 
 if TYPE_CHECKING:
     from jaxtyping import Int
@@ -41,7 +42,9 @@ def report_impossible(mdp: MDP, demonstrations: Any, impossible: str) -> None:
     bad = ~mdp.dynamics.leads(steps.state, steps.action, steps.successor)
     if not bad.any():
         return
-    trajectory, time, state, action, successor = (int(column[bad.argmax()]) for column in steps)
+    trajectory, time, *step = (int(column[bad.argmax()]) for column in steps)
+    names = mdp.state_names, mdp.action_names, mdp.state_names
+    state, action, successor = (described(number, of) for number, of in zip(step, names, strict=True))
     message = (
         f"{bad.sum()} of {len(bad)} steps have probability 0 in this model; the first is trajectory {trajectory}, "
         f"step {time}: state {state}, action {action}, then state {successor}. "

@@ -6,15 +6,18 @@ time, an occupancy a line of spikes, and the radii of a generalization a histogr
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.ticker import MaxNLocator
 
 from jaxhom import checks
 from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.names import check_names
 from jaxhom.plotting.boards import require
 from jaxhom.plotting.palette import AMOUNT, BLUE, PURPLE, VERMILLION
 from jaxhom.plotting.pictures import unpadded
@@ -22,18 +25,27 @@ from jaxhom.plotting.pictures import unpadded
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Float, Int
 
+_NAMED = 24  # states or actions, that names have room for
+_LETTERS = 60  # of all of them side by side
 _DECADES = 4  # of an occupancy that are told apart
 _NAMES = ("\N{MULTIPLICATION SIGN} nothing found", "\N{BULLET} demonstrated")
 
 
 def plot_policy_by_state(
-    policy: Float[ArrayLike, "S A"], *, visited: Bool[ArrayLike, "S"] | None = None, ax: Axes | None = None
+    policy: Float[ArrayLike, "S A"],
+    *,
+    visited: Bool[ArrayLike, "S"] | None = None,
+    state_names: Sequence[Hashable] | None = None,
+    action_names: Sequence[Hashable] | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draws a policy as an image: states from left to right, actions from top to bottom, dark where likely.
 
     Args:
       policy: [S, A], rows sum to 1.
       visited: bool [S], states to mark below the image, the demonstrated ones for instance.
+      state_names: S names (`mdp.state_names`), to show in place of numbers where there are few.
+      action_names: A names, likewise.
       ax: axes to draw on; new ones if None.
 
     Returns:
@@ -66,17 +78,24 @@ def plot_policy_by_state(
     ax.set(xlabel="state", ylabel="action")
     ax.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     ax.set_yticks([tick for tick in ax.get_yticks() if 0 <= tick < num_actions])
+    _show_names(ax.xaxis, "state_names", state_names, num_states, is_upright=True)
+    _show_names(ax.yaxis, "action_names", action_names, num_actions)
     return ax
 
 
 def plot_occupancy_by_state(
-    occupancy: Float[ArrayLike, "S *A"], *, label: str = "expected discounted visits", ax: Axes | None = None
+    occupancy: Float[ArrayLike, "S *A"],
+    *,
+    label: str = "expected discounted visits",
+    state_names: Sequence[Hashable] | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draws how often each state is visited, as spikes on a logarithmic axis.
 
     Args:
       occupancy: [S, A] or [S], not negative; summed over actions. States below 1 / 10000 of the largest have no spike.
       label: of the axis.
+      state_names: S names, to show in place of numbers where there are few.
       ax: axes to draw on; new ones if None.
 
     Returns:
@@ -102,14 +121,18 @@ def plot_occupancy_by_state(
     shown = np.flatnonzero(visits >= least)
     ax.vlines(shown, least, visits[shown], color=BLUE, linewidth=np.clip(240.0 / len(visits), 0.6, 4.0))
     ax.set(yscale="log", ylim=(least, 1.5 * largest), xlim=(-0.5, len(visits) - 0.5), xlabel="state", ylabel=label)
+    _show_names(ax.xaxis, "state_names", state_names, len(visits), is_upright=True)
     return _plain(ax)
 
 
-def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None = None) -> Axes:
+def plot_trajectories_by_state(
+    trajectories: Demonstrations, *, state_names: Sequence[Hashable] | None = None, ax: Axes | None = None
+) -> Axes:
     """Draws trajectories as lines: the state over the steps, with a ring where each begins; no answers, without time.
 
     Args:
       trajectories: M of them.
+      state_names: S names, to show in place of numbers where there are few.
       ax: axes to draw on; new ones if None.
 
     Returns:
@@ -130,6 +153,7 @@ def plot_trajectories_by_state(trajectories: Demonstrations, *, ax: Axes | None 
     ax.set(xlabel="step", ylabel="state")
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(8, integer=True))
+    _show_names(ax.yaxis, "state_names", state_names, None)
     return _plain(ax)
 
 
@@ -172,6 +196,20 @@ def plot_radius_counts(radius: Int[ArrayLike, "S"], *, ax: Axes | None = None) -
 
 def _axes(ax: Axes | None, height: float) -> Axes:
     return plt.subplots(figsize=(8.0, height), layout="constrained")[1] if ax is None else ax
+
+
+def _show_names(
+    axis: Axis, argument: str, names: Sequence[Hashable] | None, count: int | None, *, is_upright: bool = False
+) -> None:
+    """Names in place of an axis' numbers, if there are few; if `is_upright`, turned where they are long."""
+    if names is None:
+        return
+    if count is not None:
+        check_names(argument, names, count)
+    if len(names) <= _NAMED:
+        texts = [str(name) for name in names]
+        is_long = is_upright and sum(map(len, texts)) > _LETTERS
+        axis.set_ticks(range(len(texts)), labels=texts, rotation=90 if is_long else 0)
 
 
 def _plain(ax: Axes) -> Axes:

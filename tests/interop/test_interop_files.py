@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import small_models
 
+import jaxhom
 from jaxhom.interop import (
     FileError,
     load_arrays,
@@ -243,3 +244,42 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
         save_policy(path, [[0.0, 1.0]])
     assert [entry.name for entry in tmp_path.iterdir()] == ["policy.npz"]
     np.testing.assert_array_equal(load_policy(path), [[1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("names", "back"),
+    [
+        (["door", "room"], ("door", "room")),
+        ([3, -1], (3, -1)),
+        ([(0, 1), (2, 3)], ((0, 1), (2, 3))),
+        ([(0, 1), (2, 3, 4)], ((0, 1), (2, 3, 4))),
+        ([("kitchen", True), None], (("kitchen", True), None)),
+        ([2.5, "2.5"], (2.5, "2.5")),
+        ([(), (0,)], ((), (0,))),
+        ([frozenset("a"), object], ("frozenset({'a'})", "<class 'object'>")),
+    ],
+)
+def test_names_come_back(tmp_path, names, back):
+    path = tmp_path / "model.npz"
+    save_mdp(path, jaxhom.MDP.from_dense(np.full((2, 1, 2), 0.5), discount=0.9, state_names=names, action_names=["a"]))
+    loaded = load_mdp(path)
+    assert loaded.state_names == back and loaded.action_names == ("a",)
+    assert [type(name) for name in loaded.state_names] == [type(name) for name in back]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (
+            np.zeros(2),
+            r"model.npz: state_names must be texts .* or whole numbers .*, got dtype float64",
+        ),
+        (np.zeros((2, 1, 1), int), r"model.npz: state_names must have shape \[N\] or \[N, D\]"),
+        (np.array(["a", "a"]), r"model.npz: state_names\[1\] must be new"),
+        (np.array(["a"]), "model.npz: state_names must be 2 names, got 1"),
+    ],
+)
+def test_bad_names_are_refused(tmp_path, names, message):
+    np.savez(tmp_path / "model.npz", transition=np.full((2, 1, 2), 0.5), discount=0.9, state_names=names)
+    with pytest.raises(FileError, match=message):
+        load_mdp(tmp_path / "model.npz")

@@ -166,3 +166,30 @@ def test_names_are_looked_up(name, message):
         named(state_names=["door", "room"]).state_index(name)
     with pytest.raises(ValueError, match=r"this model's actions have no names: build it with action_names="):
         jaxhom.gridworld(2).mdp.action_index(name)
+
+
+def test_unions_keep_names():
+    union = jaxhom.disjoint_union([named(state_names=["a", "b"], action_names=["go"])] * 2)
+    assert union.mdp.state_names == ((0, "a"), (0, "b"), (1, "a"), (1, "b")) and union.mdp.action_names == ("go",)
+    assert jaxhom.disjoint_union([named(), named(state_names=["a", "b"])]).mdp.state_names is None
+
+
+def test_texts_use_names():
+    """Errors, explanations, bounds and questions say what states and actions are called."""
+    mdp = MDP.from_function(lake, (0, 0), discount=0.9, features=lambda place, move: [sum(place)])
+    walk = ["right", "down"], [(0, 0), (0, 1)]
+    indices = [mdp.state_index(place) for place in walk[1]], [mdp.action_index(move) for move in walk[0]]
+    demonstrations = jaxhom.Demonstrations.from_trajectories([indices])
+    general = jaxhom.soft_local_homomorphism(mdp, demonstrations)
+    asked, voter = mdp.state_index((0, 2)), mdp.state_index((0, 1))
+    text = str(general.explain(asked))
+    assert text.startswith(f"State {asked} (0, 2): ") and "Policy down 1, by Algorithm 1" in text
+    assert f"Map f from the local model of {asked} (0, 2)" in text and f"voter {voter} (0, 1): " in text
+    bound = jaxhom.loss_bound(mdp, demonstrations, general)
+    assert f"states that contribute most: {int(np.argmax(bound.contributions))} (" in str(bound)
+    queries = jaxhom.query_states(mdp, demonstrations, general, 1)
+    state = int(queries.states[0])
+    assert f"state {state} {mdp.state_names[state]}: score" in str(queries)
+    jump = jaxhom.Demonstrations.from_trajectories([([0, 15], [0, 0])])
+    with pytest.raises(ValueError, match=r"state 0 \(0, 0\), action 0 'up', then state 15 \(3, 3\)"):
+        jump.validate(mdp)

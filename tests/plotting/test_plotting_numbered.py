@@ -86,3 +86,14 @@ def test_answers_have_no_time_and_no_offset(ax):
     for one, other in zip(plain.lines, answered.lines, strict=False):
         np.testing.assert_allclose(other.get_xydata(), one.get_xydata())
     np.testing.assert_allclose(answered.lines[2].get_xydata(), [[1, 2]])
+
+
+def test_few_states_and_actions_are_called_by_their_names():
+    names = {"state_names": ["door", "room", (0, 1)], "action_names": ["stay", "go"]}
+    drawn = plotting.plot_policy_by_state(POLICY, **names)
+    assert [label.get_text() for label in drawn.get_xticklabels()] == ["door", "room", "(0, 1)"]
+    assert [label.get_text() for label in drawn.get_yticklabels()] == ["stay", "go"]
+    many = plotting.plot_occupancy_by_state(np.ones(100), state_names=range(1000, 1100))
+    assert "1000" not in [label.get_text() for label in many.get_xticklabels()]
+    with pytest.raises(ValueError, match="state_names must be 3 names, got 2"):
+        plotting.plot_policy_by_state(POLICY, state_names=["a", "b"])

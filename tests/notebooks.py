@@ -50,15 +50,14 @@ def _run_cell(source: str, name: str, namespace: dict[str, Any]) -> list[dict[st
     last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
     with contextlib.redirect_stdout(printed):
         exec(compile(tree, name, "exec"), namespace)
-        if last is not None and not source.rstrip().endswith(";"):
+        if last is not None:
             value = eval(compile(ast.Expression(last.value), name, "eval"), namespace)
-        elif last is not None:
-            eval(compile(ast.Expression(last.value), name, "eval"), namespace)
-    outputs = []
+    outputs: list[dict[str, Any]] = []
     if printed.getvalue():
-        outputs.append({"name": "stdout", "output_type": "stream", "text": _lines(printed.getvalue())})
-    if value is not None:
-        outputs.append({"data": _shown(value), "execution_count": None, "metadata": {}, "output_type": "execute_result"})
+        outputs.append({"output_type": "stream", "name": "stdout", "text": _lines(printed.getvalue())})
+    if value is not None and not source.endswith(";"):
+        shown = {"execution_count": None, "data": _shown(value), "metadata": {}}
+        outputs.append({"output_type": "execute_result", **shown})
     return outputs + [_picture(plt.figure(number)) for number in plt.get_fignums()]
 
 

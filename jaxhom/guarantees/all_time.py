@@ -87,7 +87,7 @@ class _Planned(NamedTuple):
 
 
 def _planned(choices: Choices, reward: Float[np.ndarray, "S A"], size: float, start: Int[np.ndarray, " S"]) -> _Planned:
-    """The best choices for one reward, of which `size` is the largest that can be met; `start` is where solves begin."""
+    """The best choices for one reward, whose size is at most `size`; `start` is where solves begin."""
     swept = None if _is_direct(choices) else _swept(choices, reward, size)
     if swept and (swept.is_settled or not choices.model.is_solvable):
         return swept

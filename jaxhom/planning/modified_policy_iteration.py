@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from jaxtyping import Array, Bool, Float, Int
 
 _BLOCK = 16  # sweeps per look at the bounds: a look costs two more sweeps over all actions, a block at most so many
+_LONG_BLOCK = 64  # on 10^6 states a look takes 80 ms, and a sweep with chosen actions 11
 _STALL = 16.0  # roundings of the largest value up to which a span counts as none: a sum of a few terms makes them
 _LOOK_BACK = 8  # blocks after which a span that has not fallen to `_SLOW` of what it was counts as slow
 _SLOW = 0.5  # at this rate a tolerance of 1e-10 takes thousands of sweeps, where policies with solves take about ten
@@ -33,15 +34,23 @@ def iterate_values(
     value: Float[Array, "S *B"],
     tolerance: Float[Array, "*B"],
     max_iterations: int,
+    is_patient: bool = False,
+    report: Callable[[Array, Array], None] | None = None,
 ) -> tuple[Float[Array, "S *B"], Int[Array, "*B"], Bool[Array, "*B"]]:
     """Sweeps until half the span of the change is within the tolerance, or hardly shrinks, on every lane.
 
     A sweep over all actions, whose change gives the bounds, then a block of sweeps with the actions that it chose.
 
+    Args:
+      is_patient: never give up, and look at the bounds less often: for models so large that nothing else is quicker.
+        News of a reward takes as many sweeps as steps to get around; until then the span hardly shrinks.
+      report: is called on the host after every block with the residual that is left and the tolerance.
+
     Returns:
       Values, sweeps, and whether the span hardly shrinks: `is_slow`.
     """
     improve, best_action, follow, evaluate = _sweeps(mdp, reward)
+    most = _LONG_BLOCK if is_patient else _BLOCK
 
     def is_active(residual, is_slow, count):
         return (residual > tolerance) & ~is_slow & (count < max_iterations)
@@ -60,11 +69,13 @@ def iterate_values(
         residual = jnp.where(active, 0.5 * span, residual)
         # A constant offset has no effect on the span; taking it out at once keeps the values at their scale.
         centred = improved + mdp.discount / (1.0 - mdp.discount) * 0.5 * (low + high)
-        looks_back = blocks % _LOOK_BACK == _LOOK_BACK - 1
+        looks_back = (blocks % _LOOK_BACK == _LOOK_BACK - 1) & (not is_patient)
         is_slow |= active & looks_back & (residual > tolerance) & (residual > _SLOW * former)
         former = jnp.where(looks_back, residual, former)
         goes_on = is_active(residual, is_slow, count + 1)
-        length = jnp.where(jnp.any(goes_on), jnp.minimum(_BLOCK, max_iterations - count) - 1, 0)
+        length = jnp.where(jnp.any(goes_on), jnp.minimum(most, max_iterations - count) - 1, 0)
+        if report is not None:
+            jax.debug.callback(report, residual, tolerance)
         action = jax.lax.fori_loop(0, once, lambda *_: best_action(value, improved), jnp.zeros(value.shape, jnp.int32))
         policy = follow(action)
         evaluated = jax.lax.fori_loop(0, length, lambda _, v: evaluate(policy, v), centred)

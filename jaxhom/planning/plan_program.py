@@ -6,6 +6,7 @@ Everything has its batch last: rewards [S, A, B], values [S, B].
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import jax
@@ -24,7 +25,7 @@ _MAX_IMPROVEMENTS = 100  # of policy iteration inside a program; it takes 3 to 1
 _VISIBLE = 0.01  # of the values: where rounding may have made more than that, float32 has no answer
 
 
-@functools.partial(jax.jit, static_argnames=("max_iterations", "is_quick"))
+@functools.partial(jax.jit, static_argnames=("max_iterations", "is_quick", "is_patient", "report"))
 def plan_in_program(
     mdp: MDP,
     reward: Float[Array, "S A B"],
@@ -33,8 +34,10 @@ def plan_in_program(
     *,
     max_iterations: int,
     is_quick: bool,
+    is_patient: bool = False,
+    report: Callable[[Array, Array], None] | None = None,
 ) -> tuple[Plan, Bool[Array, " B"]]:
-    """Plans for B rewards, from given values on.
+    """Plans for B rewards, from given values on; `is_patient` and `report` are those of `iterate_values`.
 
     Returns:
       The plan, with its batch first, and whether its residual leaves open which action is the best somewhere. With
@@ -42,7 +45,7 @@ def plan_in_program(
     """
     lane = 0 if reward.shape[-1] == 1 else slice(None)  # gathers of single numbers, not of rows of one
     value, iterations, is_slow = iterate_values(
-        mdp, reward[..., lane], value[..., lane], tolerance[lane], max_iterations
+        mdp, reward[..., lane], value[..., lane], tolerance[lane], max_iterations, is_patient, report
     )
     value, iterations, is_slow = value.reshape(len(reward), -1), iterations.reshape(-1), is_slow.reshape(-1)
     settled = jnp.zeros(is_slow.shape, bool)

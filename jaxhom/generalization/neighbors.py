@@ -11,6 +11,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.generalization import evidence, votes_in_program
 from jaxhom.generalization.explainers import ByCoordinates, ByHops
+from jaxhom.generalization.grouped_votes import are_searched, vote_of_nearest_by_group
 from jaxhom.generalization.result import Generalization, extend
 from jaxhom.generalization.uniform import uniform_elsewhere
 from jaxhom.generalization.votes import Votes, plain_ballots, vote_of_nearest, vote_of_rings
@@ -76,11 +77,20 @@ def nearest_neighbors(
         return extend(mdp, start, _votes_in_program(mdp, demonstrations, start, coordinates), None)
     visited, policy = np.asarray(start.visited), np.asarray(start.policy)
     if coordinates is None:
-        votes = vote_of_rings(mdp, visited, policy, ~visited, plain_ballots(mdp, visited, policy))
+        votes = _votes_by_hops(mdp, visited, policy)
         return extend(mdp, start, votes, ByHops(mdp))
     accept = functools.partial(evidence.has_vote, mdp, policy) if mdp.restricts_actions else None
     votes = vote_of_nearest(deciding_states(mdp, visited), policy, coordinates, accept)
     return extend(mdp, start, votes, ByCoordinates(mdp, coordinates))
+
+
+def _votes_by_hops(mdp: MDP, visited, policy) -> Votes:
+    ballots, group = plain_ballots(mdp, visited, policy), np.zeros(len(visited), int)
+    if mdp.restricts_actions:  # states with the same actions ask alike
+        _, group = np.unique(np.asarray(mdp.allowed), axis=0, return_inverse=True)
+    if are_searched(len(visited), int(visited.sum()), group):
+        return vote_of_nearest_by_group(mdp, visited, policy, ~visited, ballots, group)
+    return vote_of_rings(mdp, visited, policy, ~visited, ballots)
 
 
 def _votes_in_program(mdp: MDP, demonstrations: Demonstrations, start: Generalization, coordinates) -> Votes:

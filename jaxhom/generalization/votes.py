@@ -52,7 +52,7 @@ def vote_of_rings(mdp: MDP, visited, policy, asking, ballots: Ballots, least: in
         together.
       least: grow s^t until it holds so many voters, or does not grow any more.
     """
-    found = _no_votes(visited, policy)
+    found = no_votes(visited, policy)
     experts, waiting = np.flatnonzero(visited), np.flatnonzero(asking)
     total, voters, radius = np.zeros(np.shape(policy)), np.zeros(len(policy), int), np.full(len(policy), -1)
     for t, ring in enumerate(_rings(mdp, experts), start=1):
@@ -66,7 +66,7 @@ def vote_of_rings(mdp: MDP, visited, policy, asking, ballots: Ballots, least: in
         waiting = waiting[voters[waiting] < least]
         if not waiting.size:
             break
-    return _elected(found, total, voters, radius)
+    return elected(found, total, voters, radius)
 
 
 def vote_of_all(visited, policy, asking, ballots: Ballots, group: np.ndarray | None = None) -> Votes:
@@ -76,7 +76,7 @@ def vote_of_all(visited, policy, asking, ballots: Ballots, group: np.ndarray | N
       visited, policy, asking, ballots: as in `vote_of_rings`.
       group: int [S], the same for states for which all ballots are the same; asked once for each.
     """
-    found = _no_votes(visited, policy)
+    found = no_votes(visited, policy)
     experts, states = np.flatnonzero(visited), np.flatnonzero(asking)
     _, first, where = np.unique((states if group is None else group[states]), return_index=True, return_inverse=True)
     different, num_actions = states[first], np.shape(policy)[1]
@@ -89,10 +89,10 @@ def vote_of_all(visited, policy, asking, ballots: Ballots, group: np.ndarray | N
     everywhere = np.zeros(np.shape(policy)), np.zeros(len(policy), int)
     for place, numbers in zip(everywhere, (total, voters), strict=True):
         place[states] = numbers[where]
-    return _elected(found, *everywhere, np.ones(len(policy), int))
+    return elected(found, *everywhere, np.ones(len(policy), int))
 
 
-def _elected(found: Votes, total, voters, radius) -> Votes:
+def elected(found: Votes, total, voters, radius) -> Votes:
     """The votes `found` with those of the states that got any; `total` [S, A], the rest [S]."""
     is_found = voters > 0
     found.policy[is_found] = total[is_found] / total[is_found].sum(axis=1, keepdims=True)
@@ -105,7 +105,7 @@ def vote_of_nearest(visited, policy, coordinates: np.ndarray, accept=None) -> Vo
 
     `accept` decides pairs as in `vote_of_rings`; all are accepted if None.
     """
-    found = _no_votes(visited, policy)
+    found = no_votes(visited, policy)
     experts, waiting = np.flatnonzero(visited), np.flatnonzero(~visited)
     if not experts.size:
         return found
@@ -134,7 +134,8 @@ def is_nearest(square: np.ndarray, tie: float = TIE) -> np.ndarray:
     return square <= square.min(axis=1, keepdims=True) * (1 + tie)
 
 
-def _no_votes(visited, policy) -> Votes:
+def no_votes(visited, policy) -> Votes:
+    """Demonstrated states with what was seen there, and nothing for the others."""
     radius = np.where(visited, 0, -1).astype(np.int32)
     return Votes(np.array(policy), radius, np.array(visited).astype(np.int32))
 

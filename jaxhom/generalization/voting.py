@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.generalization import evidence
+from jaxhom.generalization.grouped_votes import are_searched, vote_of_nearest_by_group
 from jaxhom.generalization.votes import Ballots, Votes, vote_of_all, vote_of_rings
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import Goal
@@ -104,6 +105,12 @@ class HostBallots:
     def elect(self, visited, policy, asking, group: Int[np.ndarray, " S"] | None) -> Votes:
         """The votes in the states that ask, bool [S]; `group` as in `vote_of_all`."""
         least = self._rule.least_voters
+        is_plain = least == 1 and group is not None and not self._rule.is_weighted
+        if is_plain and are_searched(self._mdp.num_states, int(visited.sum()), group[asking]):
+            votes = vote_of_nearest_by_group(self._mdp, visited, policy, asking, self, group)
+            if not self.undecided.any():
+                return votes
+            self.undecided[:], self.status = 0, Status.SOLVED  # to be counted within the radii alone
         if least is not None:
             return vote_of_rings(self._mdp, visited, policy, asking, self, least)
         votes = vote_of_all(visited, policy, asking, self, group)

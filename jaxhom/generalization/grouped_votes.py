@@ -47,8 +47,8 @@ def vote_of_nearest_by_group(
     """
     found, experts = no_votes(visited, policy), np.flatnonzero(visited)
     total, voters, radius = np.zeros(np.shape(policy)), np.zeros(len(policy), int), np.full(len(policy), -1)
-    forward = reachable_within(mdp, 1)
-    backward = scipy.sparse.csr_array(forward.T)
+    forward = _Links(reachable_within(mdp, 1))
+    backward = _Links(scipy.sparse.csr_array(forward.matrix.T))
     for number in np.unique(group[asking]):
         members = asking & (group == number)
         votes = ballots(np.full(len(experts), np.argmax(members)), experts)
@@ -60,10 +60,26 @@ def vote_of_nearest_by_group(
     return elected(found, total, voters, radius)
 
 
-def _layers(forward, backward, sources: Int[np.ndarray, " E"], wanted: Bool[np.ndarray, " S"]) -> Iterator[Layer]:
+class _Links:
+    """The rows of a sparse matrix, to look up some of them at a time."""
+
+    def __init__(self, matrix: scipy.sparse.csr_array) -> None:
+        self.matrix, self._first, self._count = matrix, matrix.indptr[:-1].astype(np.int64), np.diff(matrix.indptr)
+
+    def __call__(self, rows: Int[np.ndarray, " L"]) -> tuple[np.ndarray, np.ndarray]:
+        """The entries of some rows, one row after the other: which of the rows each belongs to, and its column."""
+        count = self._count[rows]
+        owner = np.repeat(np.arange(len(rows)), count)
+        shift = self._first[rows] - np.cumsum(count) + count
+        return owner, self.matrix.indices[np.arange(len(owner)) + shift[owner]]
+
+
+def _layers(
+    forward: _Links, backward: _Links, sources: Int[np.ndarray, " E"], wanted: Bool[np.ndarray, " S"]
+) -> Iterator[Layer]:
     """For t = 1, 2, ..., until all that is wanted or can be met is: the wanted states from which a source is t steps
     away, and pairs (number among these, number of a nearest source)."""
-    num_states, left = forward.shape[0], int(wanted.sum())
+    num_states, left = len(wanted), int(wanted.sum())
     layer_of, place = np.full(num_states, -1, np.int32), np.zeros(num_states, np.int32)
     layer, nearest = sources, _own_bits(len(sources))
     t = 0
@@ -75,22 +91,15 @@ def _layers(forward, backward, sources: Int[np.ndarray, " E"], wanted: Bool[np.n
             left -= len(shown)
         if not left:
             return
-        before = np.unique(_rows_of(backward, layer)[1])
+        before = np.unique(backward(layer)[1])
         before = before[layer_of[before] < 0]
         if not len(before):
             return
-        owner, following = _rows_of(forward, before)
+        owner, following = forward(before)
         is_near = layer_of[following] == t
         begin = np.searchsorted(owner[is_near], np.arange(len(before)))
         nearest = np.bitwise_or.reduceat(nearest[place[following[is_near]]], begin, axis=0)
         layer, t = before, t + 1
-
-
-def _rows_of(matrix, rows: Int[np.ndarray, " L"]) -> tuple[np.ndarray, np.ndarray]:
-    """The entries of some rows, one row after the other: which of the rows each belongs to, and its column."""
-    first, count = matrix.indptr[rows].astype(np.int64), np.diff(matrix.indptr)[rows]
-    owner = np.repeat(np.arange(len(rows)), count)
-    return owner, matrix.indices[np.arange(len(owner)) + (first - np.cumsum(count) + count)[owner]]
 
 
 def _own_bits(count: int) -> np.ndarray:

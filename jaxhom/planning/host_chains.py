@@ -33,6 +33,7 @@ _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _SMALL_ERROR, _MAX_PRODUCTS = 1e-9, 300  # of BiCGSTAB; racetracks take 50 steps
 _FIRST_SWEEPS = 20
+_MOST_SWEEPS, _SWEEPS_PER_LOOK = 30_000, 100  # ten digits at 0.999
 _SAFE = 0.1  # of the error: its residual is measured in another norm
 _latest: dict = {}  # one entry at most
 
@@ -211,6 +212,20 @@ class HostChain:
     def flow(self, source: Float[np.ndarray, "S *K"], error: float = _SMALL_ERROR) -> Float[np.ndarray, "S *K"]:
         """(I - gamma P)^-T of a source that may have either sign; likewise."""
         return self._checked(source, is_flow=True, error=error)
+
+    def swept(self, right: Float[np.ndarray, " S"], error: float, *, is_flow: bool) -> Float[np.ndarray, " S"]:
+        """V of a reward, or the flow of a source, by sweeps alone; NaN where the discount needs too many.
+
+        The last resort for large models: a chain that takes thousands of steps to where it stays leaves Krylov's steps
+        without a hold.
+        """
+        matrix = scipy.sparse.csr_array(self._transition.T) if is_flow else self._transition
+        solution = right
+        for count in range(1, _MOST_SWEEPS + 1):
+            solution = right + self._discount * (matrix @ solution)
+            if count % _SWEEPS_PER_LOOK == 0 and self._is_within(error, right, solution, is_flow):
+                return solution
+        return np.full_like(solution, np.nan)
 
     def _checked(self, right: np.ndarray, is_flow: bool, error: float) -> np.ndarray:
         if self._by_products:

@@ -225,6 +225,10 @@ def _solve_at_hand(mdp: MDP, policy: jax.Array, source: np.ndarray, *, transpose
             solve = _state_occupancy if transpose else _solve_values
             solutions[left] = solve(mdp, np.moveaxis(policies[left], 0, -1), sources[left].T, is_quick=True).T
     (left,) = np.nonzero(np.isnan(solutions).any(axis=1))
-    for lane in left if model.is_solvable else ():
-        solutions[lane] = on_host(lane)
+    for lane in left:
+        if model.is_solvable:
+            solutions[lane] = on_host(lane)
+        else:
+            chain = model.chain(policies[lane], may_factorise=False)
+            solutions[lane] = chain.swept(sources[lane].astype(np.float64), _EXACT, is_flow=transpose)
     return solutions.reshape(policy.shape[:-1]).astype(mdp.dtype)

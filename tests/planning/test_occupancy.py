@@ -18,6 +18,7 @@ import small_models
 from jaxhom import MDP
 from jaxhom.planning import chain_solver
 from jaxhom.planning import occupancy as occupancy_module
+from jaxhom.planning.host_chains import HostModel, host_model
 from jaxhom.planning.occupancy import (
     feature_expectations,
     has_occupancy,
@@ -475,3 +476,28 @@ def test_no_features_have_no_expectations():
     policies = np.full((2, 100, 3), 1 / 3)
     assert feature_expectations(mdp, policies[0]).shape == (0,)
     assert feature_expectations(mdp, policies).shape == (2, 0)
+
+
+def test_sweeps_alone_solve_what_they_should(case, rng):
+    """What large models end with, against factors."""
+    policy = small_models.random_policy(rng, *case.shape)
+    chain, reward = host_model(case.mdp).chain(policy), rng.normal(size=case.shape[0])
+    if case.mdp.discount > 0.995:
+        return
+    np.testing.assert_allclose(chain.swept(reward, 1e-12, is_flow=False), chain.value(reward), rtol=1e-9, atol=1e-9)
+    source = np.asarray(case.mdp.initial)
+    np.testing.assert_allclose(chain.swept(source, 1e-12, is_flow=True), chain.state_occupancy(source), atol=1e-9)
+
+
+def test_a_long_way_in_a_large_model(monkeypatch):
+    """Krylov's steps break off where mass only moves on, and factors are out of reach: sweeps are right at any rate."""
+    length = 3000
+    step = np.minimum(np.arange(length) + 1, length - 1)
+    start = np.arange(length) == 0
+    mdp = MDP.from_successors(step[:, None, None], np.ones((length, 1, 1)), discount=0.99, initial=start)
+    monkeypatch.setattr(HostModel, "is_solvable", False)
+    monkeypatch.setattr(HostModel, "is_soon_factorised", False)
+    mu = np.asarray(occupancy(mdp, np.ones((length, 1))))[:, 0]
+    expected = 0.99 ** np.arange(length)
+    expected[-1] /= 0.01
+    np.testing.assert_allclose(mu, expected, rtol=0, atol=1e-8)

@@ -445,3 +445,16 @@ def test_every_plan_says_how_it_ended():
     for limit, expected in ((100_000, Status.SOLVED), (1, Status.ITERATION_LIMIT)):
         for status in statuses(limit):
             assert status.tolist() == [expected] * 2
+
+
+@pytest.mark.parametrize("name", ["sparse", "restart", "absorbing"])
+def test_patient_sweeps_of_large_models(name, rng, monkeypatch, capsys):
+    """What models of more than 200,000 states go through, on small ones; it says how far it is."""
+    case = small_models.case(name)
+    reward = rng.normal(size=case.shape[:2])
+    plain = optimal_policy(case.mdp, reward)
+    monkeypatch.setattr("jaxhom.planning.optimal._SOLVED_STATES", 0)
+    patient = optimal_policy(case.mdp, reward, progress=True)
+    np.testing.assert_allclose(patient.value, plain.value, atol=1e-7)
+    assert patient.status == Status.SOLVED
+    assert "sweeps" in capsys.readouterr().err

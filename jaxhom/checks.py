@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import operator
 import reprlib
 from collections.abc import Callable
@@ -245,6 +246,17 @@ def require_slots(num_states: int, num_actions: int, width: int) -> None:
         raise ValueError(
             f"the model has {num_states} x {num_actions} x {width} successor slots (states, actions, widest row), "
             f"more than 2^31 - 2"
+        )
+
+
+def require_dense(what: str, *shape: int) -> None:
+    """Raises if a dense array is too large for 32-bit indices, saying how large it would be; before it is allocated."""
+    count = math.prod(shape)
+    if count > MAX_SLOTS:
+        size = " x ".join(map(str, shape))
+        raise ValueError(
+            f"{what} would hold {size} numbers, {8 * count / 2**30:,.0f} GiB in float64: work on its successors "
+            "(mdp.next_state, mdp.probability), or on fewer states"
         )
 
 

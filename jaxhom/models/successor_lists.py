@@ -83,6 +83,7 @@ class SuccessorLists(Dynamics):
     def transition(self) -> Float[Array, "S A S"]:
         """The dense tensor T, made anew at each call: mind its size."""
         states, actions, _ = self.probability.shape
+        checks.require_dense("the dense tensor of this model", states, actions, states)
         s, a = jnp.ogrid[:states, :actions]
         zeros = jnp.zeros((states, actions, states), self.probability.dtype)
         return zeros.at[s[..., None], a[..., None], self.next_state].add(self.probability)
@@ -119,6 +120,7 @@ class SuccessorLists(Dynamics):
 
     def state_transition(self, policy: Float[Array, "S A"]) -> Float[Array, "S S"]:
         """P_pi as a dense matrix."""
+        checks.require_dense("the dense matrix of a policy's chain", len(policy), len(policy))
         weight = policy[..., None] * self.probability
         rows = jnp.broadcast_to(jnp.arange(len(weight))[:, None, None], weight.shape)
         zeros = jnp.zeros((len(weight), len(weight)), weight.dtype)

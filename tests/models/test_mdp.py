@@ -436,3 +436,12 @@ def test_models_are_short_when_printed():
     assert text == start + "layout='successors', width=4)"
     axes = jax.tree.map(lambda _: None, gridworld(5).mdp)
     assert repr(axes).startswith("MDP(")
+
+
+def test_a_dense_tensor_that_is_too_large_says_how_large():
+    ring = np.arange(1, 50_001) % 50_000
+    mdp = MDP.from_successors(np.tile(ring[:, None, None], (1, 2, 1)), np.ones((50_000, 2, 1)), discount=0.9)
+    with pytest.raises(ValueError, match=r"would hold 50000 x 2 x 50000 numbers, 37 GiB in float64: work on its succ"):
+        mdp.transition  # noqa: B018
+    with pytest.raises(ValueError, match=r"chain would hold 50000 x 50000 numbers, 19 GiB"):
+        mdp.dynamics.state_transition(np.full((50_000, 2), 0.5))

@@ -12,7 +12,8 @@ from jaxhom.cli.options import MODEL_HELP, Parser, add_command, add_model_option
 from jaxhom.cli.results import save_figure
 from jaxhom.cli.sources import Problem, load_demonstrations_of, load_policy_of, load_problem
 from jaxhom.domains.racetrack import Racetrack
-from jaxhom.interop.files import FileError, load_arrays
+from jaxhom.interop.archives import FileError
+from jaxhom.interop.files import load_arrays
 
 _EXAMPLES = """\
 examples:

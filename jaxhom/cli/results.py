@@ -18,7 +18,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from jaxhom import interrupts
-from jaxhom.interop.files import save_demonstrations, save_policy, whole_file
+from jaxhom.interop.archives import whole_file
+from jaxhom.interop.files import save_demonstrations, save_policy
 from jaxhom.models.demonstrations import Demonstrations
 
 if TYPE_CHECKING:

@@ -24,11 +24,12 @@ from jaxhom.cli.table_files import open_table
 from jaxhom.domains.racetrack import Racetrack, racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.domains.track_maps import SHIPPED
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environment_maps import tile_map
 from jaxhom.interop.environment_tables import require_steps_of_table
 from jaxhom.interop.environments import from_gymnasium
-from jaxhom.interop.files import FileError, load_policy
+from jaxhom.interop.files import load_policy
 from jaxhom.interop.model_files import DISCOUNT, read_model
 from jaxhom.interop.trajectory_sources import demonstrations_from
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations

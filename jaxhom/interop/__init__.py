@@ -18,13 +18,13 @@ before it is needed.
 """
 
 from jaxhom.interop.all_brackets import AllBrackets, load_all_brackets, save_all_brackets
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.cassandra import from_cassandra
 from jaxhom.interop.csv_answers import answers_from_csv
 from jaxhom.interop.csv_steps import demonstrations_from_csv
 from jaxhom.interop.environment_makers import make_environment
 from jaxhom.interop.environments import GymnasiumModel, from_gymnasium
 from jaxhom.interop.files import (
-    FileError,
     load_arrays,
     load_demonstrations,
     load_mdp,

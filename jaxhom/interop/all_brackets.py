@@ -20,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom import checks
-from jaxhom.interop.files import FileError, read_archive, require_arrays, whole_file, write_archive
+from jaxhom.interop.archives import FileError, read_archive, require_arrays, whole_file, write_archive
 from jaxhom.models.inputs import as_model, check_states
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import LocalSimilarity

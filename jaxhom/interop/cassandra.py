@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.cassandra_statements import WILD, Rules, Statements, Things, number_of, start_of
-from jaxhom.interop.files import FileError
 from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries, named
 from jaxhom.interop.text_files import errors_of
 

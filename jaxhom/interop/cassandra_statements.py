@@ -21,7 +21,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxhom.interop.files import FileError
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.text_files import open_text
 from jaxhom.models.construction import check_initial
 

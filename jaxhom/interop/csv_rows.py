@@ -12,8 +12,8 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.column_names import KNOWN, plain
-from jaxhom.interop.files import FileError
 from jaxhom.interop.text_files import open_text
 
 _DELIMITERS = (",", ";", "\t", "|")

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.column_names import find_columns, listed
 from jaxhom.interop.csv_rows import Table, read_table
-from jaxhom.interop.files import FileError
 from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport
 from jaxhom.interop.numbering import NO_ACTION, Numbering, indices_by_cell, number_in_order, numberings, parsed
 from jaxhom.interop.state_sequences import inferred_actions

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.cassandra import from_cassandra
-from jaxhom.interop.files import FileError, load_arrays, load_mdp
+from jaxhom.interop.files import load_arrays, load_mdp
 from jaxhom.interop.gridworld_files import from_gridworld
 from jaxhom.interop.imported_model import ImportedModel
 from jaxhom.interop.networks import from_edges

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhom.interop.files import FileError
+from jaxhom.interop.archives import FileError
 
 
 class Columns(NamedTuple):

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 
-from jaxhom.interop.files import FileError, read_archive, write_archive
+from jaxhom.interop.archives import FileError, read_archive, write_archive
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.table import SimilarityTable

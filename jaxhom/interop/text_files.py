@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from typing import TextIO
 
-from jaxhom.interop.files import FileError
+from jaxhom.interop.archives import FileError
 
 _GZIP = b"\x1f\x8b"
 

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from jaxhom.interop.files import FileError
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.text_files import open_text
 
 _END = "\N{OBJECT REPLACEMENT CHARACTER}"  # of a line, among words

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.interop.archives import FileError, names_of_arrays
 from jaxhom.interop.column_names import KNOWN, fields_by_role, find_columns, is_keyed, listed, plain
 from jaxhom.interop.csv_steps import demonstrations_from_csv
-from jaxhom.interop.files import DEMONSTRATIONS, FileError, load_arrays, load_demonstrations, names_of_arrays
+from jaxhom.interop.files import DEMONSTRATIONS, load_arrays, load_demonstrations
 from jaxhom.interop.flat_steps import demonstrations_of_table
 from jaxhom.interop.import_reports import ImportReport
 from jaxhom.interop.saved_tables import Columns, arrow_columns, hdf5_columns, parquet_columns

@@ -116,7 +116,9 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         mask = steps & (actions != -1)
         final = arrays.get("final_states", np.full(count, -1))
         checks.require_shape("final_states", final, f"({count},)", final.shape == (count,))
-        rows = zip(states, np.where(steps & ~mask, 0, actions), length, final, strict=True)
+        if (mask != steps).any():  # hidden steps; text is left to the checks below
+            actions = np.where(mask, actions, 0)
+        rows = zip(states, actions, length, final, strict=True)
         trajectories = [(np.append(s[:n], z) if z != -1 else s[:n], a[:n]) for s, a, n, z in rows]
         is_answer = arrays.get("is_answer", np.zeros(count, bool))
         checks.require_all(

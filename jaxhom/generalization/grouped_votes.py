@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     Layer = tuple[Int[np.ndarray, " L"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]
 
-_LARGE = 3e6  # states times demonstrated states: on grids of 128 x 128 rings take 8 s, searches below a second
+_LARGE = 1e6  # states times demonstrated states: on grids of 128 x 128 rings take 8 s, searches below a second
 _MOST_WORK = 5e8  # states times groups
 
 

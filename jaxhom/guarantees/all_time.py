@@ -29,6 +29,7 @@ _SHARED_SWEEPS = 100  # before linear systems are solved
 _BLOCK = 15  # sweeps with the actions that were chosen, between two over all of them
 _LOOK_BACK, _SLOW = 8, 0.5  # after so many blocks a span that has not fallen to that of what it was counts as slow
 _MOST_BLOCKS, _LAST_SWEEPS = 1000, 100
+_NARROW_STATES = 20_000  # of a graph like a grid; with 65,000 factors took 21 s where sweeps take 8
 _DIRECT = 1e7  # states times bandwidth up to which a direct solve takes less than hundreds of sweeps
 _TOLERANCE, _ROUNDINGS = 1e-12, 8.0  # of what b may span: a share of the largest |feature|, and roundings of |V|
 
@@ -124,7 +125,8 @@ def _swept(choices: Choices, reward: Float[np.ndarray, "S A"], size: float) -> _
 def _is_direct(choices: Choices) -> bool:
     """Whether linear systems are solved by elimination before anything else is tried."""
     model = choices.model
-    return model.is_solvable and (model.is_narrow or model.num_states * model.bandwidth <= _DIRECT)
+    is_small = model.num_states <= _NARROW_STATES and model.is_narrow
+    return model.is_solvable and (is_small or model.num_states * model.bandwidth <= _DIRECT)
 
 
 def _solved(choices: Choices, actions, right: Float[np.ndarray, "S L"], *, is_flow: bool) -> Float[np.ndarray, "S L"]:

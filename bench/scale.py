@@ -108,6 +108,7 @@ def figure(rows: list[dict], path: pathlib.Path) -> None:
         panel.grid(color="#E3E3E3", linewidth=0.8)
         panel.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("seconds, first call in a process")
+    panels[0].set_ylim(top=1e5)  # room for the legends
     drawn.savefig(path, dpi=110)
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _EPS = float(np.finfo(np.float64).eps)
+_SWEPT = 1e-9  # relative error that sweeps may leave, where nothing else gets there
 _SHARED_SWEEPS = 100  # before linear systems are solved
 _BLOCK = 15  # sweeps with the actions that were chosen, between two over all of them
 _LOOK_BACK, _SLOW = 8, 0.5  # after so many blocks a span that has not fallen to that of what it was counts as slow
@@ -132,4 +133,7 @@ def _is_direct(choices: Choices) -> bool:
 def _solved(choices: Choices, actions, right: Float[np.ndarray, "S L"], *, is_flow: bool) -> Float[np.ndarray, "S L"]:
     """Values of rewards, or occupancies of distributions, under actions [S]; NaN where nothing is found."""
     chain = choices.model.chain(actions, may_iterate=True)
-    return chain.flow(right) if is_flow else chain.value(right)
+    found = chain.flow(right) if is_flow else chain.value(right)
+    for k in np.flatnonzero(np.isnan(found).any(axis=0)):  # of a large model
+        found[:, k] = chain.swept(right[:, k], _SWEPT, is_flow=is_flow)
+    return found

@@ -73,6 +73,7 @@ def names_of_arrays(path: str | os.PathLike) -> list[str]:
 
 
 def require_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], *names: str) -> None:
+    """Raises `FileError`, saying what there is, if one of the named arrays is not among those of an archive."""
     for name in names:
         if name not in arrays:
             present = ", ".join(sorted(arrays)) or "nothing"

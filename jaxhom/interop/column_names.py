@@ -49,15 +49,20 @@ def fields_by_role(source: Any, columns: Mapping[str, str] | None = None) -> dic
     Raises:
       ValueError: as `find_columns`.
     """
-    if is_keyed(source):
-        names = list(source)
-        found = _found(tuple(map(str, names)), tuple(sorted((columns or {}).items())))
-        fields = {role: source[names[place]] for role, place in found.items()}
-    else:
-        names = [name for name in (*_ATTRIBUTES, *(columns or {}).values()) if _is_field(source, name)]
-        found = _found(tuple(names), tuple(sorted((columns or {}).items())))
-        fields = {role: getattr(source, names[place]) for role, place in found.items()}
-    return {role: field for role, field in fields.items() if field is not None}
+    fields = {role: field(source, name) for role, name in names_by_role(source, columns).items()}
+    return {role: found for role, found in fields.items() if found is not None}
+
+
+def names_by_role(source: Any, columns: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """What the columns of a mapping, a data frame or an object are called, by their roles.
+
+    Raises:
+      ValueError: as `find_columns`.
+    """
+    attributes = (*_ATTRIBUTES, *(columns or {}).values())
+    names = list(source) if is_keyed(source) else [name for name in attributes if _is_field(source, name)]
+    found = _found(tuple(map(str, names)), tuple(sorted((columns or {}).items())))
+    return {role: names[place] for role, place in found.items()}
 
 
 def is_keyed(source: Any) -> bool:
@@ -65,7 +70,7 @@ def is_keyed(source: Any) -> bool:
     return isinstance(source, Mapping) or (hasattr(source, "columns") and hasattr(source, "__getitem__"))
 
 
-def field(source: Any, name: str) -> Any:
+def field(source: Any, name: Any) -> Any:
     """The column of one name, None if there is none."""
     if is_keyed(source):
         return source[name] if name in source else None  # noqa: SIM401 (data frames have no `get` of this kind)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.column_names import field, fields_by_role
+from jaxhom.interop.column_names import field, fields_by_role, names_by_role
 from jaxhom.interop.import_reports import ImportReport, with_report
 from jaxhom.interop.numbering import Numbering, numberings
 from jaxhom.models.demonstrations import Demonstrations
@@ -84,7 +84,7 @@ def read_episodes(
     numbers = numberings(mdp)
     for position, episode in enumerate(_iterate(episodes)):
         fields = _fields(position, episode, columns)
-        _require_one_episode(position, fields)
+        _require_no_jump(position, fields)
         pairs += [(position, episode)] if isinstance(episode, tuple | list) else []
         try:
             states, actions = _indices(fields["state"], fields["action"], to_states, *numbers)
@@ -93,7 +93,7 @@ def read_episodes(
             continue
         final += len(states) - len(actions)
         kept.append((states, actions))
-        ended.append(_has_terminated(position, episode, fields))
+        ended.append(_has_terminated(episode, fields))
     require_no_steps(pairs, "episode")
     return with_report(kept, dropped, final, ended)
 
@@ -107,11 +107,11 @@ def _iterate(episodes) -> Iterable:
 
 
 def _fields(position: int, episode, columns: Mapping[str, str] | None) -> dict[str, Any]:
-    """What an episode holds, by role: states and actions at least."""
+    """What an episode holds, by role: states and actions at least. Ends are flags, none set before the last step."""
     if isinstance(episode, tuple | list) and len(episode) == 2 and not hasattr(episode, "_fields"):
         return dict(zip(("state", "action"), episode, strict=True))
     try:
-        fields = fields_by_role(episode, columns)
+        fields, names = fields_by_role(episode, columns), names_by_role(episode, columns)
     except ValueError as error:
         raise ValueError(f"episode {position}: {error}") from None
     if not {"state", "action"} <= set(fields):
@@ -119,22 +119,25 @@ def _fields(position: int, episode, columns: Mapping[str, str] | None) -> dict[s
             f"episode {position} must have obs and acts, or observations and actions, or be a pair of them; "
             f"got {type(episode).__name__}"
         )
+    for role in [role for role in ("terminated", "truncated") if role in fields]:
+        name = f"episode {position}: {names[role]}"
+        flags = np.ravel(checks.as_host_array(name, fields[role]))
+        fields[role] = as_flags(name, flags, len(flags))
+        if fields[role][:-1].any():
+            raise ValueError(_FLAT.format(f"episode {position} ends before its last step ({names[role]})"))
     return fields
 
 
-def _require_one_episode(position: int, fields: Mapping[str, Any]) -> None:
-    """Raises if an episode has an end before its last step, or a step that does not begin where the former led to."""
-    for role in ("terminated", "truncated"):
-        if _flags_of(position, fields, role)[:-1].any():
-            raise ValueError(_FLAT.format(f"episode {position} ends before its last step ({role})"))
+def _require_no_jump(position: int, fields: Mapping[str, Any]) -> None:
+    """Raises if an episode has a step that does not begin where the former led to."""
     before, after = fields["state"], fields.get("next_state")
     if after is not None and np.shape(before) == np.shape(after) and not np.array_equal(before[1:], after[:-1]):
         raise ValueError(_FLAT.format(f"episode {position} jumps: a next observation is not that of the next step"))
 
 
-def _has_terminated(position: int, episode, fields: Mapping[str, Any]) -> bool:
+def _has_terminated(episode, fields: Mapping[str, Any]) -> bool:
     """Whether an episode says that it ended in a terminal state, and nothing (imitation's `infos`) that it was cut."""
-    ended, cut = (_flags_of(position, fields, role)[-1:].any() for role in ("terminated", "truncated"))
+    ended, cut = (np.any(fields.get(role, False)) for role in ("terminated", "truncated"))
     return bool(ended and not cut and not _was_cut_by_time(episode))
 
 
@@ -157,15 +160,6 @@ def is_time_limit(info: Any) -> bool:
         except ValueError:
             return False
     return isinstance(info, Mapping) and info.get("TimeLimit.truncated") is True
-
-
-def _flags_of(position: int, fields: Mapping[str, Any], role: str) -> np.ndarray:
-    """The flags of an episode in one role, bool [any number]; empty where it has none."""
-    if role not in fields:
-        return np.zeros(0, bool)
-    name = f"episode {position}: {role}"
-    flags = np.ravel(checks.as_host_array(name, fields[role]))
-    return as_flags(name, flags, len(flags))
 
 
 def as_flags(name: str, values: Any, length: int) -> np.ndarray:

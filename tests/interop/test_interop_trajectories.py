@@ -177,9 +177,9 @@ def test_unusable_episodes_are_dropped_and_reported(episode, reason):
         ([[(3, 1), (4, 0), (2, 2)]], "episode 0 must have obs and acts"),
         (imitation([0, 1], [0]), "pass a list of episodes, or, if these are flattened transitions, use"),
         (FLAT, "flattened transitions, use demonstrations_from_transitions"),
-        ([FLAT], "episode 0 ends before its last step (terminated): if these are flattened transitions"),
+        ([FLAT], "episode 0 ends before its last step (dones): if these are flattened transitions"),
         ([vars(FLAT) | {"dones": None}], "episode 0 jumps: a next observation is not that of the next step: if"),
-        ([vars(FLAT) | {"dones": None, "next_obs": None, "timeouts": [1, 0, 0, 0, 0]}], "its last step (truncated)"),
+        ([vars(FLAT) | {"dones": None, "next_obs": None, "timeouts": [1, 0, 0, 0, 0]}], "its last step (timeouts)"),
     ],
 )
 def test_what_is_no_episode_is_an_error(episodes, message):

@@ -175,5 +175,5 @@ def test_an_episode_with_both_flags_was_cut_off(name):
 
 @pytest.mark.parametrize("flag", ["no", float("nan"), 2])
 def test_flags_that_are_none_are_refused(flag):
-    with pytest.raises(ValueError, match="episode 0: terminated.* must be"):
+    with pytest.raises(ValueError, match="episode 0: terminal.* must be"):
         interop.demonstrations_from_episodes([{"obs": [0, 1], "acts": [0], "terminal": flag}])

@@ -15,7 +15,7 @@ import pytest
 from jaxhom import SimilarityTable, Status, local_similarity, locally_similar
 from jaxhom.domains.gridworld import gridworld
 from jaxhom.models.mdp import MDP
-from jaxhom.similarity import class_pairs
+from jaxhom.similarity import class_pairs, settling
 from jaxhom.similarity.classes import local_model_classes, model_rounding
 
 
@@ -281,12 +281,12 @@ def test_progress_counts_all_pairs(capsys, monkeypatch):
     mdp, _ = model_of("blocks")
     bars = []
 
-    class Recorded(class_pairs.tqdm):
+    class Recorded(settling.tqdm):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
             bars.append(self)
 
-    monkeypatch.setattr(class_pairs, "tqdm", Recorded)
+    monkeypatch.setattr(settling, "tqdm", Recorded)
     local_similarity(mdp, [40, 6, 7], [41, 6, 20], progress=True)
     assert [(bar.n, bar.total) for bar in bars] == [(3, 3)]
     assert "0/3" in capsys.readouterr().err

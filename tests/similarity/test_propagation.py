@@ -10,7 +10,7 @@ import oracles
 import pytest
 
 from jaxhom import MDP, SimilarityTable, Status
-from jaxhom.similarity import blocks, class_pairs, propagation
+from jaxhom.similarity import blocks, propagation, settling
 from jaxhom.similarity.brackets import Goal, bracket_errors
 from jaxhom.similarity.free_bounds import lower_bounds_without_iterations, upper_bounds_without_iterations
 from jaxhom.similarity.model_pairs import ModelPairs
@@ -223,12 +223,12 @@ def test_progress_counts_every_pair_once(monkeypatch):
     """Those that centres decide, intervals and solvers; and a class with itself."""
     bars = []
 
-    class Recorded(class_pairs.tqdm):
+    class Recorded(settling.tqdm):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
             bars.append(self)
 
-    monkeypatch.setattr(class_pairs, "tqdm", Recorded)
+    monkeypatch.setattr(settling, "tqdm", Recorded)
     table = SimilarityTable(MDP.from_dense(np.random.default_rng(7).dirichlet(np.ones(6), (6, 2)), discount=0.9))
     for threshold in (0.3, 0.2):
         table.complete(threshold, progress=True)

@@ -113,14 +113,24 @@ def _exits(places: np.ndarray, links: np.ndarray) -> np.ndarray:
     """int [S, A]: the links that each leads to, clockwise from the way back; -1 where it has no more."""
     begin, end = links.T
     angle = np.arctan2(*(places[end] - places[begin]).T)  # clockwise from the vertical
-    joins = end[:, None] == begin
-    is_back = joins & (end == begin[:, None])
-    joins &= ~is_back | (joins.sum(axis=1, keepdims=True) == 1)
+    beginning = _beginning_at(begin, len(places))[end]
+    joins = beginning >= 0
+    joins &= (end[beginning] != begin[:, None]) | (joins.sum(axis=1, keepdims=True) == 1)
     back = angle[:, None] + np.pi
-    turn = np.where(joins, (angle - back) % (2.0 * np.pi), np.inf)
+    turn = np.where(joins, (angle[beginning] - back) % (2.0 * np.pi), np.inf)
     num_exits = int(joins.sum(axis=1).max())
     order = np.argsort(turn, axis=1, kind="stable")[:, :num_exits]
-    return np.where(np.take_along_axis(joins, order, axis=1), order, -1)
+    exits = np.take_along_axis(beginning, order, axis=1)
+    return np.where(np.take_along_axis(joins, order, axis=1), exits, -1)
+
+
+def _beginning_at(begin: np.ndarray, num_junctions: int) -> np.ndarray:
+    """int [J, D]: the links that begin at each junction, in their order; -1 where there are no more."""
+    order = np.argsort(begin, kind="stable")
+    count = np.bincount(begin, minlength=num_junctions)
+    found = np.full((num_junctions, count.max()), -1)
+    found[begin[order], np.arange(len(begin)) - (np.cumsum(count) - count)[begin[order]]] = order
+    return found
 
 
 def _strongly_connected(links: np.ndarray, leads_to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

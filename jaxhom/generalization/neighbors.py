@@ -30,6 +30,7 @@ def nearest_neighbors(
     *,
     metric: str = "hops",
     coordinates: Float[ArrayLike, "S D"] | None = None,
+    progress: bool = False,
 ) -> Generalization:
     """The votes of the nearest demonstrated states, by steps in the model or by Euclidean distance.
 
@@ -39,6 +40,7 @@ def nearest_neighbors(
       metric: "hops", the least number of steps by any actions from the state to the demonstrated one (the paper's
         Manhattan distance), or "euclidean".
       coordinates: [S, D], positions of the states; needed for "euclidean" alone.
+      progress: show a bar over the states of a large model, by steps.
 
     Returns:
       `Generalization`. All demonstrated states at the least distance vote. For "euclidean", `radius` is that
@@ -77,19 +79,21 @@ def nearest_neighbors(
         return extend(mdp, start, _votes_in_program(mdp, demonstrations, start, coordinates), None)
     visited, policy = np.asarray(start.visited), np.asarray(start.policy)
     if coordinates is None:
-        votes = _votes_by_hops(mdp, visited, policy)
+        votes = _votes_by_hops(mdp, visited, policy, progress)
         return extend(mdp, start, votes, ByHops(mdp))
     accept = functools.partial(evidence.has_vote, mdp, policy) if mdp.restricts_actions else None
     votes = vote_of_nearest(deciding_states(mdp, visited), policy, coordinates, accept)
     return extend(mdp, start, votes, ByCoordinates(mdp, coordinates))
 
 
-def _votes_by_hops(mdp: MDP, visited, policy) -> Votes:
+def _votes_by_hops(mdp: MDP, visited, policy, progress: bool) -> Votes:
     ballots, group = plain_ballots(mdp, visited, policy), np.zeros(len(visited), int)
     if mdp.restricts_actions:  # states with the same actions ask alike
         _, group = np.unique(np.asarray(mdp.allowed), axis=0, return_inverse=True)
     if are_searched(len(visited), int(visited.sum()), group):
-        return vote_of_nearest_by_group(mdp, visited, policy, ~visited, ballots, group)
+        votes = vote_of_nearest_by_group(mdp, visited, policy, ~visited, ballots, group, progress)
+        if votes is not None:
+            return votes
     return vote_of_rings(mdp, visited, policy, ~visited, ballots)
 
 

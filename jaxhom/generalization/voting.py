@@ -107,8 +107,8 @@ class HostBallots:
         least = self._rule.least_voters
         is_plain = least == 1 and group is not None and not self._rule.is_weighted
         if is_plain and are_searched(self._mdp.num_states, int(visited.sum()), group[asking]):
-            votes = vote_of_nearest_by_group(self._mdp, visited, policy, asking, self, group)
-            if not self.undecided.any():
+            votes = vote_of_nearest_by_group(self._mdp, visited, policy, asking, self, group, self._progress)
+            if votes is not None and not self.undecided.any():
                 return votes
             self.undecided[:], self.status = 0, Status.SOLVED  # to be counted within the radii alone
         if least is not None:

@@ -6,6 +6,7 @@ import pytest
 import small_models
 
 import jaxhom
+from bench.road_graph import road_graph
 from jaxhom.generalization import grouped_votes
 
 
@@ -68,6 +69,31 @@ def test_some_states_lack_actions(monkeypatch):
     for learn in (jaxhom.soft_local_homomorphism, jaxhom.nearest_neighbors):
         with monkeypatch.context() as patch:
             require_equal(*both(patch, lambda learn=learn: learn(mdp, walks)))
+
+
+def test_groups_are_asked_together_or_by_rings(monkeypatch):
+    """Few groups in one call; all states different, or too many searches: rings, which ask for the nearest alone."""
+    roads = road_graph(9, num_destinations=3).mdp
+    walk = np.asarray(roads.allowed / roads.allowed.sum(axis=1, keepdims=True))
+    walks = jaxhom.sample_demonstrations(jax.random.key(0), roads, walk, 3, 6)
+    learn = lambda: jaxhom.soft_local_homomorphism(roads, walks)  # noqa: E731
+    monkeypatch.setattr(grouped_votes, "_SHARED", 1)
+    calls, decisions = [], jaxhom.SimilarityTable.decisions
+    monkeypatch.setattr(
+        jaxhom.SimilarityTable, "decisions", lambda *args, **options: calls.append(0) or decisions(*args, **options)
+    )
+    plain, grouped = both(monkeypatch, learn)
+    require_equal(plain, grouped)
+    assert len(calls) > 2
+    calls.clear()
+    learn()
+    assert len(calls) == 1
+    monkeypatch.setattr(grouped_votes, "_MOST_WORK", 0)
+    require_equal(plain, learn())
+    require_equal(jaxhom.nearest_neighbors(roads, walks), jaxhom.nearest_neighbors(roads, walks, progress=True))
+    monkeypatch.undo()
+    assert grouped_votes.are_searched(10**6, 1000, np.zeros(10**6, int))
+    assert not grouped_votes.are_searched(3000, 300, np.arange(3000))
 
 
 def test_undecided_states_are_counted_by_rings(monkeypatch):

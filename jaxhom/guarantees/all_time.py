@@ -133,6 +133,10 @@ def _is_direct(choices: Choices) -> bool:
 def _solved(choices: Choices, actions, right: Float[np.ndarray, "S L"], *, is_flow: bool) -> Float[np.ndarray, "S L"]:
     """Values of rewards, or occupancies of distributions, under actions [S]; NaN where nothing is found."""
     chain = choices.model.chain(actions, may_iterate=True)
+    if is_flow and choices.model.moves_sooner(_SWEPT):
+        found = np.stack([chain.moved(column, _SWEPT) for column in right.T], axis=1)
+        if np.isfinite(found).all():
+            return found
     found = chain.flow(right) if is_flow else chain.value(right)
     for k in np.flatnonzero(np.isnan(found).any(axis=0)):  # of a large model
         found[:, k] = chain.swept(right[:, k], _SWEPT, is_flow=is_flow)

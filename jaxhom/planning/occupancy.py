@@ -28,9 +28,12 @@ from jaxhom import checks
 from jaxhom.models.inputs import as_model, check_policy, check_reward, require_policy_shape
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.chain_solver import solve_chain
-from jaxhom.planning.host_chains import host_model
+from jaxhom.planning.host_chains import HostChain, host_model
+from jaxhom.planning.progress import progress_of_sweeps
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
     Policy = Float[ArrayLike, "*B S A"] | Int[ArrayLike, " S"]
@@ -39,7 +42,7 @@ _EXACT = 1e-10  # relative error of products on the host that counts as none
 NO_OCCUPANCY = 1e-9  # share of all discounted time below which eq. (5) is 0 / 0: what solvers leave where nothing goes
 
 
-def occupancy(mdp: MDP, policy: Policy) -> Float[Array, "*B S A"]:
+def occupancy(mdp: MDP, policy: Policy, *, progress: bool = False) -> Float[Array, "*B S A"]:
     """Discounted state-action occupancy x(s, a) = E sum_t gamma^t 1[s_t = s, a_t = a].
 
     Works under `jit`, `vmap` and `grad`, in the policy and in all numbers of the model.
@@ -47,6 +50,7 @@ def occupancy(mdp: MDP, policy: Policy) -> Float[Array, "*B S A"]:
     Args:
       mdp: the model.
       policy: [S, A] or [B, S, A], rows sum to 1; integers [S] are the actions of one that is deterministic.
+      progress: show how far the residual is, on large models whose arrays are concrete.
 
     Returns:
       [S, A] or [B, S, A]; each sums to 1 / (1 - discount).
@@ -65,13 +69,13 @@ def occupancy(mdp: MDP, policy: Policy) -> Float[Array, "*B S A"]:
     mdp = as_model(mdp)
     policy = check_policy(mdp, policy)
     if checks.is_at_hand(mdp, policy):
-        return checks.to_device(_occupancy_at_hand(mdp, policy))
+        return checks.to_device(_occupancy_at_hand(mdp, policy, progress))
     if policy.ndim == 3:
         return jnp.moveaxis(_occupancy(mdp, jnp.moveaxis(policy, 0, -1)), -1, 0)
     return _occupancy(mdp, policy)
 
 
-def feature_expectations(mdp: MDP, policy: Policy) -> Float[Array, "*B K"]:
+def feature_expectations(mdp: MDP, policy: Policy, *, progress: bool = False) -> Float[Array, "*B K"]:
     """Discounted feature expectations V_i(pi) = sum_{s, a} x_pi(s, a) phi_i(s, a).
 
     Works under `jit`, `vmap` and `grad`, as `occupancy`.
@@ -79,6 +83,7 @@ def feature_expectations(mdp: MDP, policy: Policy) -> Float[Array, "*B K"]:
     Args:
       mdp: the model, with K features.
       policy: [S, A] or [B, S, A], rows sum to 1; or integers [S].
+      progress: show how far the residual is, on large models whose arrays are concrete.
 
     Returns:
       [K] or [B, K]; divide by 1 / (1 - discount) for a weighted average per step.
@@ -97,12 +102,14 @@ def feature_expectations(mdp: MDP, policy: Policy) -> Float[Array, "*B K"]:
     mdp = as_model(mdp)
     policy = check_policy(mdp, policy)
     if checks.is_at_hand(mdp, policy):
-        pairs = _occupancy_at_hand(mdp, policy).reshape(*policy.shape[:-2], mdp.allowed.size)
+        pairs = _occupancy_at_hand(mdp, policy, progress).reshape(*policy.shape[:-2], mdp.allowed.size)
         return checks.to_device(pairs @ np.asarray(mdp.features).reshape(mdp.allowed.size, mdp.num_features))
     return jnp.einsum("...sa,sak->...k", occupancy(mdp, policy), mdp.features)
 
 
-def policy_value(mdp: MDP, policy: Policy, reward: Float[ArrayLike, "*B S A"]) -> Float[Array, "*B S"]:
+def policy_value(
+    mdp: MDP, policy: Policy, reward: Float[ArrayLike, "*B S A"], *, progress: bool = False
+) -> Float[Array, "*B S"]:
     """State values V(s) = E[sum_t gamma^t r(s_t, a_t) | s_0 = s] of a policy.
 
     Works under `jit`, `vmap` and `grad`, in policy, reward and all numbers of the model.
@@ -111,6 +118,7 @@ def policy_value(mdp: MDP, policy: Policy, reward: Float[ArrayLike, "*B S A"]) -
       mdp: the model.
       policy: [S, A] or [B, S, A], rows sum to 1; or integers [S].
       reward: [S, A], or [B, S, A] beside a batch of policies.
+      progress: show how far the residual is, on large models whose arrays are concrete.
 
     Returns:
       [S] or [B, S], in units of reward, discounted sums: up to 1 / (1 - discount) times the largest reward.
@@ -132,7 +140,7 @@ def policy_value(mdp: MDP, policy: Policy, reward: Float[ArrayLike, "*B S A"]) -
     policy = check_policy(mdp, policy)
     if checks.is_at_hand(mdp, policy, reward):
         reward_under_policy = (np.asarray(policy) * reward).sum(axis=-1)
-        return checks.to_device(_solve_at_hand(mdp, policy, reward_under_policy, transpose=False))
+        return checks.to_device(_solve_at_hand(mdp, policy, reward_under_policy, transpose=False, progress=progress))
     reward_under_policy = (policy * reward).sum(axis=-1)
     if policy.ndim == 3:
         batch_last = jnp.moveaxis(policy, 0, -1)
@@ -198,12 +206,15 @@ def _solve_values(mdp: MDP, policy: jax.Array, source: jax.Array, *, is_quick: b
     return solve_chain(mdp, policy, source, transpose=False, is_quick=is_quick)
 
 
-def _occupancy_at_hand(mdp: MDP, policy: jax.Array) -> np.ndarray:
+def _occupancy_at_hand(mdp: MDP, policy: jax.Array, progress: bool) -> np.ndarray:
     """`occupancy` of concrete policies."""
-    return _solve_at_hand(mdp, policy, np.asarray(mdp.initial), transpose=True)[..., None] * np.asarray(policy)
+    mu = _solve_at_hand(mdp, policy, np.asarray(mdp.initial), transpose=True, progress=progress)
+    return mu[..., None] * np.asarray(policy)
 
 
-def _solve_at_hand(mdp: MDP, policy: jax.Array, source: np.ndarray, *, transpose: bool) -> np.ndarray:
+def _solve_at_hand(
+    mdp: MDP, policy: jax.Array, source: np.ndarray, *, transpose: bool, progress: bool = False
+) -> np.ndarray:
     """State occupancies (of sources that are distributions) or values of concrete policies, [S] or [B, S].
 
     The host is asked first where it is sure to be quick, and last, for what the device could not do, where it can.
@@ -211,24 +222,35 @@ def _solve_at_hand(mdp: MDP, policy: jax.Array, source: np.ndarray, *, transpose
     policies = np.asarray(policy).reshape(-1, mdp.num_states, mdp.num_actions)
     sources = np.broadcast_to(source, (len(policies), mdp.num_states))
     model, solutions = host_model(mdp), np.full(sources.shape, np.nan)
+    is_few = model.iterates_sooner(len(policies))
 
-    def on_host(lane: int, **options) -> np.ndarray:
-        chain = model.chain(policies[lane], **options)
-        return (chain.state_occupancy if transpose else chain.value)(sources[lane].astype(np.float64), _EXACT)
+    def open_lanes() -> np.ndarray:
+        return np.flatnonzero(np.isnan(solutions).any(axis=1))
 
-    if not model.solves_sooner(len(policies)):
-        if model.iterates_sooner(len(policies)):
-            for lane in range(len(policies)):
-                solutions[lane] = on_host(lane, may_iterate=True, may_factorise=False)
-        (left,) = np.nonzero(np.isnan(solutions).any(axis=1))
-        if len(left):
+    def on_host(solve: Callable[[HostChain, np.ndarray], np.ndarray], **options) -> None:
+        for lane in open_lanes():
+            solutions[lane] = solve(model.chain(policies[lane], **options), sources[lane].astype(np.float64))
+
+    def on_device() -> None:
+        if len(left := open_lanes()):
             solve = _state_occupancy if transpose else _solve_values
             solutions[left] = solve(mdp, np.moveaxis(policies[left], 0, -1), sources[left].T, is_quick=True).T
-    (left,) = np.nonzero(np.isnan(solutions).any(axis=1))
-    for lane in left:
+
+    def solved(chain: HostChain, source: np.ndarray) -> np.ndarray:
+        return (chain.state_occupancy if transpose else chain.value)(source, _EXACT)
+
+    with progress_of_sweeps(progress) as report:
+        if transpose and model.moves_sooner(_EXACT):
+            on_host(lambda chain, source: chain.moved(source, _EXACT, report), may_factorise=False)
+        if not model.solves_sooner(len(policies)):
+            if is_few:
+                on_host(solved, may_iterate=True, may_factorise=False)
+            if not (is_few and model.is_swept(_EXACT)):
+                on_device()
         if model.is_solvable:
-            solutions[lane] = on_host(lane)
+            on_host(solved)
         else:
-            chain = model.chain(policies[lane], may_factorise=False)
-            solutions[lane] = chain.swept(sources[lane].astype(np.float64), _EXACT, is_flow=transpose)
+            on_host(
+                lambda chain, source: chain.swept(source, _EXACT, is_flow=transpose, report=report), may_factorise=False
+            )
     return solutions.reshape(policy.shape[:-1]).astype(mdp.dtype)

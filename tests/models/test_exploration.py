@@ -114,6 +114,9 @@ def test_errors_of_the_function_say_where():
     with pytest.raises(ZeroDivisionError) as caught:
         MDP.from_function(lambda s: {"a": [(1 / (2 - s), s + 1)]}, 1, discount=0.9)
     assert caught.value.__notes__ == ["in successors(2)"]
+    with pytest.raises(ZeroDivisionError) as caught:
+        MDP.from_function(lambda s: {"a": [(1.0, 2)]}, 1, discount=0.9, features=lambda s, a: [1 / (2 - s)])
+    assert caught.value.__notes__ == ["in features(2, 'a')"]
 
 
 def named(**names):
@@ -128,6 +131,14 @@ def test_names_stay_with_the_model_on_the_host():
     assert mdp.replace(state_names=None).state_names is None
     assert named(state_names=np.array([[0, 1], [2, 3]])).state_names == ((0, 1), (2, 3))
     assert jax.jit(lambda model: model)(mdp).state_names is None  # what a program returns has none
+
+
+def test_names_are_of_python_whatever_they_came_as():
+    """What NumPy makes reads `np.int64(3)` in a text, and a file gives it back as one."""
+    mdp = named(state_names=[(np.int64(0), (np.str_("door"),)), np.float64(0.5)], action_names=np.array(["go"]))
+    assert repr((mdp.state_names, mdp.action_names)) == "(((0, ('door',)), 0.5), ('go',))"
+    assert mdp.state_index(np.float64(0.5)) == 1 == mdp.state_index(0.5)
+    assert repr(mdp.replace(state_names=np.arange(2, dtype=np.int32)[::-1].copy()).state_names) == "(1, 0)"
 
 
 def test_models_that_differ_in_names_share_programs():

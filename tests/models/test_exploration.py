@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import re
 
 import jax
 import numpy as np
@@ -204,3 +205,31 @@ def test_texts_use_names():
     jump = jaxhom.Demonstrations.from_trajectories([([0, 15], [0, 0])])
     with pytest.raises(ValueError, match=r"state 0 \(0, 0\), action 0 'up', then state 15 \(3, 3\)"):
         jump.validate(mdp)
+
+
+@pytest.mark.parametrize(
+    ("fail", "message"),
+    [
+        (lambda mdp: jaxhom.policy_value(mdp, [[1, 0], [0.5, 0.4]], [[0, 0], [0, 0]]), "policy[1 'room'] must be 1,"),
+        (
+            lambda mdp: jaxhom.policy_value(mdp, [[1, 0], [2, -1]], [[0, 0], [0, 0]]),
+            "policy[1 'room', 1 'go'] must not",
+        ),
+        (
+            lambda mdp: jaxhom.feature_expectations(mdp, np.full((3, 2, 2), 0.5)),
+            "policy[0, 0 'door', 1 'go'] is an action",
+        ),
+        (lambda mdp: jaxhom.optimal_policy(mdp, [[0, 0], [0, np.nan]]), "reward[1 'room', 1 'go'] must be finite"),
+        (lambda mdp: mdp.replace(probability=0.9 * mdp.probability), "probability[0 'door', 0 'stay'] must be 1"),
+        (
+            lambda mdp: jaxhom.Demonstrations.from_trajectories([([1, 0], [1, 1])]).validate(mdp),
+            "actions[0, 1] is not allowed in its state (index: trajectory, step), got 1: action 1 'go' in state 0",
+        ),
+    ],
+)
+def test_errors_in_arrays_use_names(fail, message):
+    allowed = [[True, False], [True, True]]
+    names = {"state_names": ["door", "room"], "action_names": ["stay", "go"]}
+    mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.9, features=np.ones((2, 1)), allowed=allowed, **names)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        fail(mdp)

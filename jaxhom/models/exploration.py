@@ -158,7 +158,8 @@ class _Found:
         if number == len(self._states):
             if number >= self._max:
                 raise ValueError(
-                    f"more than {self._max} states can be reached: pass a larger max_states, or make states coarser"
+                    f"more than {self._max} states can be reached, {checks.in_one_line(state)} the last of them: "
+                    "pass a larger max_states, or make states coarser"
                 )
             self._states.append(state)
         return number

@@ -16,6 +16,7 @@ import numpy as np
 from jaxhom import checks
 
 Names = tuple[Hashable, ...]
+_PLAIN = (int, str)  # what most names are made of
 
 
 def check_names(argument: str, names: Iterable[Hashable] | None, count: int) -> Names | None:
@@ -39,9 +40,10 @@ def check_names(argument: str, names: Iterable[Hashable] | None, count: int) -> 
 
 def _of_python(name: Any) -> Any:
     """A name without NumPy's types, which nobody writes and no file gives back: `3` for `np.int64(3)`."""
-    if isinstance(name, np.number | np.bool_ | np.str_ | np.bytes_):
-        return name.item()
-    return tuple(map(_of_python, name)) if type(name) is tuple else name
+    if type(name) is tuple:
+        return tuple([part if type(part) in _PLAIN else _of_python(part) for part in name])
+    is_scalar = isinstance(name, np.generic) and isinstance(name, np.number | np.bool_ | np.str_ | np.bytes_)
+    return name.item() if is_scalar else name
 
 
 def numbers_of(argument: str, names: Names) -> dict[Hashable, int]:

@@ -87,7 +87,10 @@ def test_dtypes_of_python_and_numpy_are_taken():
         ({"successors": lambda s: {"a": [(1.0, s, 0.0)]}}, "outcomes must be a list of pairs .* among them"),
         ({"successors": lambda s: ["a"]}, r"successors\('x'\) must be a mapping from actions to outcomes"),
         ({"successors": lambda s: None}, "there are no actions"),
-        ({"successors": lambda s: {"a": [(1.0, s + "x")]}, "max_states": 9}, "more than 9 states can be reached"),
+        (
+            {"successors": lambda s: {"a": [(1.0, s + "x")]}, "max_states": 3},
+            "more than 3 states can be reached, 'xxxx' the last of them: pass a larger max_states",
+        ),
         ({"max_states": 0}, "max_states must be at least 1"),
         ({"actions": ["b"]}, r"action 'a': not one of the given actions \['b'\]"),
         ({"actions": ["a", "a"]}, r"actions\[1\] must be new, got 'a' again, as \[0\]"),

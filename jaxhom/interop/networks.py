@@ -266,9 +266,14 @@ def _read_by_networkx(path: str | os.PathLike, directed: bool) -> Any:
             return None
         lines += file
 
+    ends = lines[0].partition("{")[0]
+    delimiter = next((mark for mark in ",;\t" if mark in ends), None)
+
     def parse(networkx: Any) -> Any:
-        kind = networkx.DiGraph if directed else networkx.Graph
-        return networkx.parse_edgelist(lines, create_using=kind)
+        several = networkx.MultiDiGraph if directed else networkx.MultiGraph
+        graph = networkx.parse_edgelist(lines, create_using=several, delimiter=delimiter)
+        single = (networkx.DiGraph if directed else networkx.Graph)(graph)
+        return single if single.number_of_edges() == graph.number_of_edges() else graph
 
     return _by_networkx(path, "list of links", parse)
 

@@ -164,11 +164,13 @@ def test_links_that_begin_where_they_end(tmp_path):
     assert model.mdp.features[:, 0, 0].tolist() == [-3, -5, -5]
 
 
-@pytest.mark.parametrize("directed", [True, False])
-def test_lists_that_networkx_wrote(tmp_path, directed):
-    graph = (networkx.DiGraph if directed else networkx.Graph)([("a", "b", {"weight": 2}), ("b", "c", {"weight": 1})])
-    networkx.write_edgelist(graph, tmp_path / "roads.edgelist")
-    model = from_edges(tmp_path / "roads.edgelist", discount=0.9, directed=directed)
+@pytest.mark.parametrize("delimiter", [" ", ",", "\t", ";"])
+@pytest.mark.parametrize("kind", ["Graph", "DiGraph", "MultiGraph", "MultiDiGraph"])
+def test_lists_that_networkx_wrote(tmp_path, kind, delimiter):
+    links = [("a", "b", {"weight": 2}), ("b", "c", {"weight": 1}), *[("a", "b", {"weight": 3})] * ("Multi" in kind)]
+    graph = getattr(networkx, kind)(links)
+    networkx.write_edgelist(graph, tmp_path / "roads.edgelist", delimiter=delimiter)
+    model = from_edges(tmp_path / "roads.edgelist", discount=0.9, directed=graph.is_directed())
     expected = from_networkx(graph, discount=0.9)
     assert model.state_names == expected.state_names
     np.testing.assert_array_equal(model.mdp.features, expected.mdp.features)

@@ -429,6 +429,20 @@ def test_hdf5_files(tmp_path):
         demonstrations_from(tmp_path / "cut.h5")
 
 
+@pytest.mark.parametrize("kind", ["S", object])
+def test_texts_in_hdf5_files(tmp_path, kind):
+    """They are bytes there, of one length or of several."""
+    h5py = pytest.importorskip("h5py")
+    names = {"state_names": ["hall", "k\u00fcche"], "action_names": ["go"]}
+    mdp = MDP.from_dense(np.eye(2)[:, None], discount=0.9, **names)
+    columns = {"observations": ["k\u00fcche", "hall"], "actions": ["go", "go"]}
+    with h5py.File(tmp_path / "walks.hdf5", "w") as file:
+        for name, column in columns.items():
+            file[name] = np.array([text.encode() for text in column], kind)
+        file["timeouts"] = [False, True]
+    assert pairs(demonstrations_from(tmp_path / "walks.hdf5", mdp=mdp)[0]) == [([1, 0], [0, 0])]
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

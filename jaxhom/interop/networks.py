@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.interop.archives import FileError
-from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
+from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries
 from jaxhom.interop.text_files import errors_of, open_text, without_gz
 from jaxhom.interop.text_tables import TextTable, numbered
 
@@ -83,7 +83,7 @@ def from_networkx(
         length=_lengths(links, length),
         places=_places(nodes, data),
     )
-    return _model(network, discount, states)
+    return _model(network, discount, states, _remarks(links, network.length))
 
 
 def from_edges(
@@ -157,7 +157,7 @@ class _Network:
     places: np.ndarray | None
 
 
-def _model(network: _Network, discount: Any, states: str) -> ImportedModel:
+def _model(network: _Network, discount: Any, states: str, remarks: Sequence[str] = ()) -> ImportedModel:
     if states not in STATES:
         raise ValueError(f"states must be one of {', '.join(STATES)}, got {states!r}")
     if not len(network.begin):
@@ -183,6 +183,7 @@ def _model(network: _Network, discount: Any, states: str) -> ImportedModel:
         features=features,
         state_names=network.names if by_link else network.nodes,
         coordinates=places,
+        remarks=remarks,
     )
 
 
@@ -225,6 +226,12 @@ def _lengths(links: Sequence[tuple], length: str | None) -> np.ndarray | None:
         missing = next((link[:-1] for link in links if length not in link[-1]), "the graph")
         raise ValueError(f"link {missing} has no attribute {length!r}")
     return np.array([_number(link[-1][name], f"{name} of link {link[:-1]}") for link in links])
+
+
+def _remarks(links: Sequence[tuple], lengths: np.ndarray | None) -> list[str]:
+    """Which lengths are not used because some links have none."""
+    counts = {name: sum(name in link[-1] for link in links) for name in _LENGTHS} if lengths is None else {}
+    return [f"{name} ignored: {counted(len(links) - n, 'link')} without" for name, n in counts.items() if n]
 
 
 def _places(nodes: Sequence[Hashable], data: Sequence[dict]) -> np.ndarray | None:

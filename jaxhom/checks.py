@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import math
 import operator
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Array, Bool, Float, Int, Num, Shaped
 
 F = TypeVar("F", bound=Callable)
+Axes = Sequence[Sequence[Any] | None]  # names of the indices along each axis of an array, where they have some
 
 MAX_SLOTS = 2**31 - 2  # flat indices of the solvers are int32, and one is the padding's
 
@@ -116,32 +118,42 @@ def require_shape(name: str, array: Any, expected: str, condition: bool) -> None
 
 
 def require_all(
-    name: str, array: Shaped[np.ndarray, "*N *X"], good: Bool[np.ndarray, "*N"], message: str, remark: str = ""
+    name: str,
+    array: Shaped[np.ndarray, "*N *X"],
+    good: Bool[np.ndarray, "*N"],
+    message: str,
+    remark: str = "",
+    axes: Axes = (),
 ) -> None:
     """Raises with the first index where `good` (same leading axes as `array`) is false; `remark` ends the message."""
     if not np.all(good):
         index = tuple(int(i) for i in np.argwhere(~good)[0])
-        value = array[index]
-        where = list(index) if index else ""  # a scalar has no index to name
-        raise ValueError(f"{name}{where} {message}, got {value}{remark}")
+        named = [
+            str(i) if names is None else f"{i} {in_one_line(names[i])}"
+            for i, names in itertools.zip_longest(index, axes[: len(index)])
+        ]
+        where = f"[{', '.join(named)}]" if index else ""  # a scalar has no index to name
+        raise ValueError(f"{name}{where} {message}, got {array[index]}{remark}")
 
 
-def require_floats(name: str, array: Shaped[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+def require_floats(name: str, array: Shaped[np.ndarray, "*N"], axes: Axes = ()) -> Float[np.ndarray, "*N"]:
     """Returns `array` as floating point of at most 64 bits; rejects NaN, infinity, text."""
     if array.dtype.kind not in "iubf":
         raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
     if array.dtype.kind != "f" or array.dtype.itemsize > 8:
         array = array.astype(np.float64)
-    require_all(name, array, np.isfinite(array), "must be finite")
+    require_all(name, array, np.isfinite(array), "must be finite", axes=axes)
     return array
 
 
-def require_floats_in(dtype: DTypeLike, name: str, array: Shaped[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+def require_floats_in(
+    dtype: DTypeLike, name: str, array: Shaped[np.ndarray, "*N"], axes: Axes = ()
+) -> Float[np.ndarray, "*N"]:
     """Returns `array` as floats of the given type; rejects, beside NaN and so on, what overflows there."""
-    array = require_floats(name, array)
+    array = require_floats(name, array, axes)
     with np.errstate(over="ignore"):
         converted = array.astype(dtype, copy=False)
-    require_all(name, array, np.isfinite(converted), f"is too large for {np.dtype(dtype)}")
+    require_all(name, array, np.isfinite(converted), f"is too large for {np.dtype(dtype)}", axes=axes)
     return converted
 
 
@@ -159,7 +171,7 @@ def require_integers(name: str, array: Shaped[np.ndarray, "*N"], upper: int | No
 
 
 def require_distribution(
-    name: str, array: Shaped[np.ndarray, "*M N"], rows: Bool[np.ndarray, "*M"] | None = None
+    name: str, array: Shaped[np.ndarray, "*M N"], rows: Bool[np.ndarray, "*M"] | None = None, axes: Axes = ()
 ) -> Float[np.ndarray, "*M N"]:
     """Returns `array` as floats whose last axis sums to 1; what people have is brought there.
 
@@ -170,20 +182,21 @@ def require_distribution(
       name: what to call it in messages.
       array: [..., N].
       rows: bool [...], the rows that have to be distributions; the others come back as zeros. All if None.
+      axes: what messages call the indices along each axis, beside their numbers.
 
     Raises:
       ValueError: naming the first entry that is not finite or negative, or the first row whose sum is not 1.
     """
     if rows is not None:
         array = np.where(rows[..., None], array, 0)
-    array = require_floats(name, array)
-    require_all(name, array, array >= 0, "must not be negative")
+    array = require_floats(name, array, axes)
+    require_all(name, array, array >= 0, "must not be negative", axes=axes)
     with np.errstate(over="ignore"):
         total = array.sum(axis=-1, dtype=np.float64)
     if rows is not None:
         total = np.where(rows, total, 1.0)
     remark = f" (what is within {row_tolerance(array.dtype):.0e} of 1 is brought to 1)"
-    require_all(f"sum of {name}", total, sums_to_one(total, array.dtype), "must be 1", remark)
+    require_all(f"sum of {name}", total, sums_to_one(total, array.dtype), "must be 1", remark, axes)
     is_off = np.abs(total - 1.0) > 8.0 * np.finfo(array.dtype).eps  # others stay as they are, to the bit
     if is_off.any():
         array = np.array(array)

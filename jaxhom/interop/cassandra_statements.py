@@ -8,7 +8,7 @@
 
 `*` stands for all; a number for the thing of that number, from 0 on. Where the last fields are missing, as many values
 follow as they have, row by row, or `uniform`, or for T `identity` (a matrix) or `reset` (back to the start). `#` begins
-a comment. A statement begins on a line of its own and ends where the next one begins.
+a comment. A statement ends where the next one begins, on the same line perhaps.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ WILD = -1  # the number of `*`
 _CHUNK = 100_000  # statements that are split at once
 _COMMENT = re.compile(r"#[^\n]*")
 _HEAD = re.compile(
-    r"^[ \t]*(discount|values|states|actions|observations|start(?:[ \t]+(?:include|exclude))?|T|O|R)[ \t]*:",
+    r"(?:^[ \t]*|(?<=[^\s:])[ \t]+)"  # behind a colon such a word is a name
+    r"(discount|values|states|actions|observations|start(?:[ \t]+(?:include|exclude))?|T|O|R)[ \t]*:",
     re.MULTILINE,
 )
 

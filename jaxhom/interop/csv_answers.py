@@ -15,6 +15,7 @@ from jaxhom.interop.csv_steps import column_of_indices, places_of
 from jaxhom.interop.numbering import NO_ACTION, numberings
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
+from jaxhom.models.names import described
 
 if TYPE_CHECKING:
     from jaxtyping import Int
@@ -56,7 +57,8 @@ def answers_from_csv(path: str | os.PathLike, *, mdp: MDP) -> tuple[Int[np.ndarr
     is_bad = (actions >= 0) & ~np.asarray(mdp.allowed)[states, actions]
     if is_bad.any():
         row = int(is_bad.argmax())
-        raise table.refuse(row, places["action"], f"{actions[row]} is not allowed in state {states[row]}")
+        action, state = described(actions[row], mdp.action_names), described(states[row], mdp.state_names)
+        raise table.refuse(row, places["action"], f"{action} is not allowed in state {state}")
     return states[actions >= 0], actions[actions >= 0]
 
 

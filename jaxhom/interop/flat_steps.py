@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.column_names import field, fields_by_role, listed
+from jaxhom.interop.column_names import field, fields_by_role, listed, names_by_role
 from jaxhom.interop.import_reports import ImportReport
 from jaxhom.interop.numbering import NO_ACTION, Numbering, literal, numberings, parsed
 from jaxhom.interop.state_sequences import demonstrations_from_states
@@ -154,7 +154,8 @@ def demonstrations_of_table(
     if "action" in fields and _holds_episodes(fields["state"], fields["action"]):
         return read_episodes(_one_a_row(table, by_role), mdp=mdp, to_states=to_states)
     length = len(by_role["state"])
-    by_role |= {role: as_flags(role, by_role[role], length) for role in _FLAGS if role in fields}
+    names = names_by_role(table, columns)
+    by_role |= {role: as_flags(names.get(role, role), by_role[role], length) for role in _FLAGS if role in fields}
     if to_states is not None:
         by_role |= {role: parsed(by_role[role]) for role in ("state", "next_state") if role in fields}
     has_action = ~_is_missing(by_role["action"]) if "action" in fields else np.ones(length, bool)
@@ -198,15 +199,27 @@ def _of_one_length(first: str, columns: Mapping[str, Any]) -> dict[str, np.ndarr
 
 
 def _column(role: str, field: Any) -> np.ndarray:
-    """A column as an array: of lists, where it holds sequences of unequal length."""
+    """A column as an array: of arrays, where it holds sequences of unequal length, and of names that have parts."""
     try:
-        return checks.as_host_array(role, field)
+        array = checks.as_host_array(role, field)
     except ValueError:
         if not isinstance(field, list | tuple):
             raise
+    else:
+        if not (array.dtype.kind == "U" and isinstance(field, list | tuple) and any(map(_is_mixed, field))):
+            return array
     array = np.empty(len(field), object)
-    array[:] = [np.asarray(cell) for cell in field]
+    for row, cell in enumerate(field):
+        array[row] = cell if _is_mixed(cell) else np.asarray(cell)
     return array
+
+
+def _is_mixed(cell: Any) -> bool:
+    """Whether a cell is a name like `("kitchen", 0)`, which an array would make one of texts, or `((0, 1), "hall")`."""
+    if not isinstance(cell, tuple):
+        return False
+    is_text = [isinstance(part, str) for part in cell]
+    return any(is_text) and not all(is_text)
 
 
 def _filled(table: Any, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.interop.archives import FileError
-from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
+from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries
 from jaxhom.interop.text_files import errors_of, open_text, without_gz
 from jaxhom.interop.text_tables import TextTable, numbered
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 STATES = ("links", "nodes")
 _LENGTHS = ("length", "weight")
 _LOOK = 100  # lines, of which some may be comments, that show what a file is
+_COMMENTS = "#%"
 _HEADERS = (("u", "source", "from"), ("v", "target", "to"), _LENGTHS)
 
 
@@ -82,7 +83,7 @@ def from_networkx(
         length=_lengths(links, length),
         places=_places(nodes, data),
     )
-    return _model(network, discount, states)
+    return _model(network, discount, states, _remarks(links, network.length))
 
 
 def from_edges(
@@ -92,9 +93,9 @@ def from_edges(
 
     Args:
       path: a file of lines `from to`, or `from to length`, with blanks, commas, semicolons or tabs between them, plain
-        or compressed by gzip. If the first line names columns, they may stand in any order: `u`, `source` or `from`;
-        `v`, `target` or `to`; `length` or `weight`; others are ignored. `.graphml` files, and lines
-        `from to {attributes}` as networkx writes them, are read by networkx.
+        or compressed by gzip; lines that begin with # or % are left out. If the first line names columns, they may
+        stand in any order: `u`, `source` or `from`; `v`, `target` or `to`; `length` or `weight`; others are ignored.
+        `.graphml` files, and lines `from to {attributes}` as networkx writes them, are read by networkx.
       discount: scalar, strictly between 0 and 1.
       states: "links" or "nodes", as in `from_networkx`.
       directed: whether a line leads one way only; GraphML files say it themselves.
@@ -122,8 +123,9 @@ def from_edges(
             return from_networkx(graph, discount=discount, states=states)
         begin, end, length = _columns(path)
         if not directed:
-            begin, end = begin + end, end + begin
-            length = None if length is None else np.tile(length, 2)
+            back = [n for n, ends in enumerate(zip(begin, end, strict=True)) if ends[0] != ends[1]]  # a loop is its own
+            begin, end = begin + [end[n] for n in back], end + [begin[n] for n in back]
+            length = None if length is None else np.append(length, length[np.array(back, int)])
         nodes, which = numbered(begin + end)
         first, second = np.split(which, 2)
         names: list[tuple] = [*zip(begin, end, strict=True)]
@@ -155,7 +157,7 @@ class _Network:
     places: np.ndarray | None
 
 
-def _model(network: _Network, discount: Any, states: str) -> ImportedModel:
+def _model(network: _Network, discount: Any, states: str, remarks: Sequence[str] = ()) -> ImportedModel:
     if states not in STATES:
         raise ValueError(f"states must be one of {', '.join(STATES)}, got {states!r}")
     if not len(network.begin):
@@ -181,6 +183,7 @@ def _model(network: _Network, discount: Any, states: str) -> ImportedModel:
         features=features,
         state_names=network.names if by_link else network.nodes,
         coordinates=places,
+        remarks=remarks,
     )
 
 
@@ -225,6 +228,12 @@ def _lengths(links: Sequence[tuple], length: str | None) -> np.ndarray | None:
     return np.array([_number(link[-1][name], f"{name} of link {link[:-1]}") for link in links])
 
 
+def _remarks(links: Sequence[tuple], lengths: np.ndarray | None) -> list[str]:
+    """Which lengths are not used because some links have none."""
+    counts = {name: sum(name in link[-1] for link in links) for name in _LENGTHS} if lengths is None else {}
+    return [f"{name} ignored: {counted(len(links) - n, 'link')} without" for name, n in counts.items() if n]
+
+
 def _places(nodes: Sequence[Hashable], data: Sequence[dict]) -> np.ndarray | None:
     """float [N, 2], None unless all nodes have positions."""
     if data and all("x" in attributes and "y" in attributes for attributes in data):
@@ -264,9 +273,14 @@ def _read_by_networkx(path: str | os.PathLike, directed: bool) -> Any:
             return None
         lines += file
 
+    ends = lines[0].partition("{")[0]
+    delimiter = next((mark for mark in ",;\t" if mark in ends), None)
+
     def parse(networkx: Any) -> Any:
-        kind = networkx.DiGraph if directed else networkx.Graph
-        return networkx.parse_edgelist(lines, create_using=kind)
+        several = networkx.MultiDiGraph if directed else networkx.MultiGraph
+        graph = networkx.parse_edgelist(lines, create_using=several, delimiter=delimiter)
+        single = (networkx.DiGraph if directed else networkx.Graph)(graph)
+        return single if single.number_of_edges() == graph.number_of_edges() else graph
 
     return _by_networkx(path, "list of links", parse)
 
@@ -283,13 +297,15 @@ def _by_networkx(path: str | os.PathLike, what: str, read: Callable[[Any], Any])
 def _columns(path: str | os.PathLike) -> tuple[list, list, np.ndarray | None]:
     """Where links begin and end, and their lengths if these are there."""
     with open_text(path) as file:
-        is_separated = any(mark in file.readline() for mark in ",;\t")
-    table = TextTable.of_separated(path) if is_separated else TextTable.of_words(path)
+        first = next((line for line in file if line.strip() and line.lstrip()[0] not in _COMMENTS), "")
+    read = TextTable.of_separated if any(mark in first for mark in ",;\t") else TextTable.of_words
+    table = read(path, _COMMENTS)
     if not len(table):
         raise FileError(f"{path}: it has no links")
     header = [text.strip().lower() for text in table.row(0)]
     found = [[place for place, name in enumerate(header) if name in names] for names in _HEADERS]
-    if found[0] and found[1]:
+    is_named = bool(found[0] and found[1])
+    if is_named:
         table = table.after(1)
     else:
         table.require_width(2, 3, "`from to` or `from to length`")
@@ -301,5 +317,22 @@ def _columns(path: str | os.PathLike) -> tuple[list, list, np.ndarray | None]:
         if "" in texts:
             raise table.error(texts.index(""), "a link must begin and end somewhere")
     with contextlib.suppress(ValueError):
-        ends = [[*map(int, texts)] for texts in ends]
+        ends = _whole_numbers(ends)
+    if not is_named and _have_names(ends):
+        known = "; ".join(" or ".join(names) for names in _HEADERS)
+        raise table.error(0, f"{' '.join(table.row(0))!r} above numbers: columns are called {known}")
     return ends[0], ends[1], table.numbers(found[2][0], "length") if found[2] else None
+
+
+def _whole_numbers(columns: list[list]) -> list[list]:
+    """Columns of texts as whole numbers; `ValueError` if one is none."""
+    return [[*map(int, texts)] for texts in columns]
+
+
+def _have_names(columns: list[list]) -> bool:
+    """Whether columns hold texts in the first line and whole numbers in all others."""
+    try:
+        below = _whole_numbers([column[1:] for column in columns])
+    except ValueError:
+        return False
+    return len(below[0]) > 0 and not any(str(column[0]).lstrip("-").isdecimal() for column in columns)

@@ -2,8 +2,8 @@
 
 A name is whatever a model calls a state by: a text, a number, a tuple of them. Arrays and lists count as tuples, and
 NumPy's numbers as Python's, so that an observation finds its state in whatever form it was kept; in a text file a name
-stands as Python writes it, `(3, 4)` or `[3, 4]`. Where a model names its states, a whole number means a name if one of
-the names is a whole number, and else an index.
+stands as Python writes it, `(3, 4)`, `[3, 4]` or `Place(x=3)`. Where a model names its states, a whole number means a
+name if one of the names is a whole number, and else an index.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from jaxhom.models.mdp import MDP
 from jaxhom.models.names import look_up
 
 NO_ACTION = frozenset(("", "nan", "none", "null", "na", "n/a", "<na>"))  # what stands for no index
+_OF_NUMPY = re.compile(r"\bnp\.\w+\(([^()]*)\)")  # its scalars, as they stand in tuples
 _MOST_CHARACTERS = 100_000  # of a cell that is looked at as a Python literal
 
 
@@ -48,6 +49,8 @@ class Numbering:
             for name in (text, literal(text)):
                 if name in self._by_name:
                     return self._by_name[name]
+            if (index := self._by_text.get(text)) is not None:
+                return index
         number = whole_number(text)
         if number is None or self._has_numbers:
             self._refuse(text)
@@ -95,6 +98,14 @@ class Numbering:
     @functools.cached_property
     def _by_name(self) -> Mapping[Hashable, int]:
         return {key_of(name): index for index, name in enumerate(self.names or ())}
+
+    @functools.cached_property
+    def _by_text(self) -> Mapping[str, int | None]:
+        """By what Python writes for each name, perhaps an object; None where that is the same for several."""
+        found: dict[str, int | None] = {}
+        for index, name in enumerate(self.names or ()):
+            found[str(name)] = None if str(name) in found else index
+        return found
 
     @functools.cached_property
     def _has_numbers(self) -> bool:
@@ -183,12 +194,12 @@ def key_of(value: Any) -> Hashable:
 
 
 def literal(text: str) -> Hashable:
-    """The number, tuple or text that a cell writes as Python does, `[0 1]` as NumPy prints it too; else the cell."""
+    """The number, tuple or text that a cell writes as Python or NumPy do: `[0 1]`, `(np.int64(3),)`; else the cell."""
     if len(text) <= _MOST_CHARACTERS and text[:1] in "([{'\"-+.0123456789" and text:
         if text[0] == "[" and "," not in text:
             text = re.sub(r"(?<=[^\s\[])\s+(?=[^\s\]])", ", ", text)
         try:
-            return key_of(ast.literal_eval(text))
+            return key_of(ast.literal_eval(_OF_NUMPY.sub(r"\1", text) if "np." in text else text))
         except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
             return text
     return text

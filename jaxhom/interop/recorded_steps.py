@@ -120,8 +120,12 @@ def with_ends(steps: RecordedSteps, terminated: Any, end_state: bool) -> Recorde
 def _keys(name: str, values: Any) -> list[Hashable]:
     """What each entry is called."""
     try:
-        return keys_of(values)
+        keys = keys_of(values)
     except TypeError:
         raise ValueError(f"{name} must be a sequence, got {type(values).__name__}") from None
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
+    for index, key in enumerate(keys):
+        if any(isinstance(part, float) and part != part for part in (key if type(key) is tuple else (key,))):
+            raise ValueError(f"{name}[{index}] must not be NaN, which is equal to nothing, got {key}")
+    return keys

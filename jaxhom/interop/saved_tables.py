@@ -68,10 +68,16 @@ def hdf5_columns(path: pathlib.Path, is_wanted: Callable[[str], bool]) -> Column
 def _group(group: Any, is_wanted: Callable[[str], bool]) -> dict[str, Any]:
     """The fields of a group; a field may be a group in turn, such as observations of several parts."""
     return {
-        name: _group(field, lambda _: True) if hasattr(field, "items") else field[()]
+        name: _group(field, lambda _: True) if hasattr(field, "items") else _values(field)
         for name, field in group.items()
         if is_wanted(name)
     }
+
+
+def _values(dataset: Any) -> Any:
+    """What a data set of an HDF5 file holds; texts are kept there as bytes."""
+    is_text = importlib.import_module("h5py").check_string_dtype(dataset.dtype) is not None
+    return dataset.asstr("utf-8", "replace")[()] if is_text else dataset[()]
 
 
 def _columns(table: Any, is_wanted: Callable[[str], bool]) -> Columns:

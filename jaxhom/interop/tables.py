@@ -19,6 +19,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.interop.archives import FileError
 from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
+from jaxhom.interop.numbering import whole_number
 from jaxhom.interop.text_files import errors_of
 from jaxhom.interop.text_tables import TextTable
 
@@ -90,7 +91,7 @@ def _of_file(path: str | os.PathLike, discount, columns: dict[str, Hashable]) ->
     def values(name: str) -> np.ndarray | list[Hashable]:
         texts = rows.columns[places[name]]
         try:
-            return np.array([*map(int, texts)], np.int64)
+            return np.array([*map(_whole, texts)], np.int64)
         except (ValueError, OverflowError):
             stripped = [*map(str.strip, texts)]
         if "" in stripped:
@@ -101,6 +102,17 @@ def _of_file(path: str | os.PathLike, discount, columns: dict[str, Hashable]) ->
         return rows.numbers(places[name], f"column {name!r}")
 
     return _of_columns(places, values, numbers, _ignored(header, places), discount)
+
+
+def _whole(text: str) -> int:
+    """3, and 3.0 as programs write columns of integers that are floats to them."""
+    try:
+        return int(text)
+    except ValueError:
+        number = whole_number(text)
+        if number is None or abs(number) >= _TOO_LARGE:
+            raise
+        return number
 
 
 def _is_whole(text: str) -> bool:

@@ -35,29 +35,29 @@ class TextTable:
     widths: np.ndarray
 
     @classmethod
-    def of_words(cls, path: str | os.PathLike) -> TextTable:
-        """Words with blanks between them; without blank lines and comments, lines that begin with `#`."""
+    def of_words(cls, path: str | os.PathLike, comments: str = "#") -> TextTable:
+        """Words with blanks between them; without blank lines, and those that begin with a letter of `comments`."""
         with open_text(path) as file:
             stripped = [line.strip() for line in file]
-        kept = [number for number, line in enumerate(stripped, start=1) if line and line[0] != "#"]
+        kept = [number for number, line in enumerate(stripped, start=1) if not _is_left_out(line, comments)]
         columns, widths = _split([stripped[number - 1] for number in kept], None)
         return cls(path, kept, columns, widths)
 
     @classmethod
-    def of_separated(cls, path: str | os.PathLike) -> TextTable:
-        """Fields, some in quotes perhaps, with commas, semicolons or tabs between them, without blank lines.
+    def of_separated(cls, path: str | os.PathLike, comments: str = "") -> TextTable:
+        """Fields, some in quotes perhaps, with commas, semicolons or tabs between them; lines as in `of_words`.
 
         Which it is is the one of which the first line has most.
         """
         with open_text(path, newline="") as file:
             text = file.read()
-        separator = max(",;\t", key=text.partition("\n")[0].count)
+        plain = text.splitlines()
+        kept = [number for number, line in enumerate(plain, start=1) if not _is_left_out(line, comments)]
+        separator = max(",;\t", key=plain[kept[0] - 1].count) if kept else ","
         if '"' in text:
-            lines, rows = _quoted(path, text, separator)
+            lines, rows = _quoted(path, text, separator, comments)
             columns, widths = _filled_up(rows)
             return cls(path, lines, columns, widths)
-        plain = text.splitlines()
-        kept = [number for number, line in enumerate(plain, start=1) if line.strip()]
         columns, widths = _split([plain[number - 1] for number in kept], separator)
         return cls(path, kept, columns, widths)
 
@@ -119,6 +119,11 @@ def numbered(values: Iterable[Hashable]) -> tuple[list, np.ndarray]:
     return [*numbers], np.array(which, int)
 
 
+def _is_left_out(line: str, comments: str) -> bool:
+    begin = line.lstrip()[:1]
+    return not begin or begin in comments
+
+
 def _split(lines: list[str], separator: str | None) -> tuple[list[list[str]], np.ndarray]:
     """Columns and widths of lines; all lines of a chunk are split at once where they have equally many fields."""
     width = len(lines[0].split(separator)) if lines else 0
@@ -142,12 +147,12 @@ def _filled_up(rows: list[list[str]]) -> tuple[list[list[str]], np.ndarray]:
     return [[row[place] if place < len(row) else "" for row in rows] for place in range(width)], widths
 
 
-def _quoted(path: str | os.PathLike, text: str, separator: str) -> tuple[list[int], list[list[str]]]:
+def _quoted(path: str | os.PathLike, text: str, separator: str, comments: str) -> tuple[list[int], list[list[str]]]:
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     lines, rows = [], []
     try:
         for row in reader:
-            if any(row):
+            if any(row) and not (row[0] and _is_left_out(row[0], comments)):
                 lines.append(reader.line_num)
                 rows.append(row)
     except csv.Error as error:

@@ -22,6 +22,7 @@ from jaxhom import checks
 from jaxhom.models import episode_ends, impossible_steps
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, uniform_policy
+from jaxhom.models.names import described
 from jaxhom.models.sampling import sample_walks
 from jaxhom.models.trajectories import padded, require_flags, with_single_steps
 from jaxhom.programs import quick_jit
@@ -194,9 +195,13 @@ class Demonstrations(Record):
         message = f"must lie in [0, {mdp.num_states}), or be -1 where it is not known (index: trajectory)"
         checks.require_all("final_states", final, (final >= -1) & (final < mdp.num_states), message)
         if mdp.restricts_actions and not checks.is_traced(mdp.allowed):
-            exists = np.asarray(mdp.allowed)[np.where(mask, states, 0), np.where(mask, actions, 0)]
-            message = "is not allowed in its state (index: trajectory, step)"
-            checks.require_all("actions", actions, exists | ~mask, message)
+            exists = np.asarray(mdp.allowed)[np.where(mask, states, 0), np.where(mask, actions, 0)] | ~mask
+            if not exists.all():
+                first = tuple(np.argwhere(~exists)[0])
+                message = "is not allowed in its state (index: trajectory, step)"
+                state = described(states[first], mdp.state_names)
+                action = described(actions[first], mdp.action_names)
+                checks.require_all("actions", actions, exists, message, f": action {action} in state {state}")
 
 
 def require_demonstrations(demonstrations: Any) -> Demonstrations:

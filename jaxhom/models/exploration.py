@@ -59,11 +59,7 @@ def explore(
     columns = {} if actions is None else numbers_of("actions", tuple(actions))
     source, action, target, chance, ends = [], [], [], [], []
     for number, state in enumerate(tqdm(found, "states", disable=not progress, unit=" states")):
-        try:
-            offered = successors(state)
-        except Exception as error:
-            error.add_note(f"in successors({checks.in_one_line(state)})")
-            raise
+        offered = _call("successors", successors, state)
         for name, outcomes in _offers(state, offered):
             column = _column(columns, state, name, is_open=actions is None)
             for probability, following in _outcomes(state, name, outcomes):
@@ -87,6 +83,15 @@ def explore(
         initial=initial,
         ends=np.array(ends),
     )
+
+
+def _call(name: str, function: Callable, *given: Any) -> Any:
+    """What a function of the caller's returns; what it raises says for which state it was called."""
+    try:
+        return function(*given)
+    except Exception as error:
+        error.add_note(f"in {name}({', '.join(map(checks.in_one_line, given))})")
+        raise
 
 
 def padded(explored: Explored) -> tuple[np.ndarray, np.ndarray]:
@@ -115,7 +120,7 @@ def features_of(features: Callable[[Any, Any], Sequence[float]], explored: Explo
     for pair in rows.tolist():
         state, action = divmod(pair, len(explored.actions))
         names = explored.states[state], explored.actions[action]
-        row = checks.as_host_array(f"features of {_where(*names)}", features(*names))
+        row = checks.as_host_array(f"features of {_where(*names)}", _call("features", features, *names))
         if table is None:
             table = np.zeros((len(explored.states), len(explored.actions), row.size))
         good = row.shape == table.shape[2:] and row.dtype.kind in "iubf" and np.isfinite(row).all()
@@ -153,7 +158,8 @@ class _Found:
         if number == len(self._states):
             if number >= self._max:
                 raise ValueError(
-                    f"more than {self._max} states can be reached: pass a larger max_states, or make states coarser"
+                    f"more than {self._max} states can be reached, {checks.in_one_line(state)} the last of them: "
+                    "pass a larger max_states, or make states coarser"
                 )
             self._states.append(state)
         return number

@@ -52,14 +52,21 @@ def check_policy(mdp: MDP, policy: Any, name: str = "policy", *, batch: bool = T
         return jax.nn.one_hot(policy, mdp.num_actions, dtype=mdp.dtype)
     if is_traced:
         return jnp.asarray(policy, mdp.dtype)
-    return checks.to_device(_allowed_only(mdp, name, checks.require_distribution(name, policy)), mdp.dtype)
+    policy = checks.require_distribution(name, policy, axes=_axes(mdp, policy.ndim))
+    return checks.to_device(_allowed_only(mdp, name, policy), mdp.dtype)
+
+
+def _axes(mdp: MDP, ndim: int) -> checks.Axes:
+    """What messages call the indices of an array [..., S, A]."""
+    return (*[None] * (ndim - 2), mdp.state_names, mdp.action_names)
 
 
 def _allowed_only(mdp: MDP, name: str, policy: Float[np.ndarray, "*B S A"]) -> Float[np.ndarray, "*B S A"]:
     """The policy, or `ValueError` where it takes an action that is not allowed."""
     if mdp.restricts_actions:
         message = "is an action that is not allowed there"
-        checks.require_all(name, policy, (policy == 0) | np.asarray(mdp.allowed), message)
+        good = (policy == 0) | np.asarray(mdp.allowed)
+        checks.require_all(name, policy, good, message, axes=_axes(mdp, policy.ndim))
     return policy
 
 
@@ -145,7 +152,8 @@ def check_reward_values(
         if mdp.restricts_actions and with_actions and not checks.is_traced(mdp.allowed):
             host = np.where(np.asarray(mdp.allowed), host, 0)
         minus = (host == -np.inf) if may_forbid and host.dtype.kind == "f" else np.zeros(host.shape, bool)
-        finite = checks.require_floats_in(mdp.dtype, "reward", np.where(minus, 0, host))
+        axes = _axes(mdp, host.ndim) if with_actions else ()
+        finite = checks.require_floats_in(mdp.dtype, "reward", np.where(minus, 0, host), axes)
         reward = np.where(minus, -np.inf, finite).astype(mdp.dtype)
     if mdp.restricts_actions and reward.shape[-2:] == (mdp.num_states, mdp.num_actions):
         xp = checks.arrays_of(mdp.allowed, reward)

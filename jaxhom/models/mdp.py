@@ -409,6 +409,7 @@ def _replacement(mdp: MDP, name: str, new) -> jax.Array | Names | None:
         return checks.to_device(construction.check_initial(checks.as_host_array(name, new), mdp.num_states), old.dtype)
     new = checks.as_host_array(name, new)
     checks.require_shape(name, new, str(old.shape), new.shape == old.shape)
-    new = checks.require_distribution(name, new, np.asarray(mdp.allowed) if mdp.restricts_actions else None)
+    rows = np.asarray(mdp.allowed) if mdp.restricts_actions else None
+    new = checks.require_distribution(name, new, rows, (mdp.state_names, mdp.action_names))
     checks.require_all(name, new, (new == 0) | mdp.dynamics.open_slots(), "is a successor that the model did not have")
     return checks.to_device(new, old.dtype)

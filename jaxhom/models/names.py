@@ -1,8 +1,8 @@
 """What states and actions are called, beside their numbers.
 
-Names are hashable values, all different: texts, tuples such as (row, column), whatever the maker of a model has. All
-work is done on numbers; names are for people, and for finding a number again. They are kept on the host and take no
-part in `jit`, `vmap` and `grad`: a model that comes out of a program has none.
+Names are hashable values, all different: texts, tuples such as (row, column), whatever the maker of a model has; those
+of NumPy's types become Python's. All work is done on numbers; names are for people, and for finding a number again.
+They are kept on the host and take no part in `jit`, `vmap` and `grad`: a model that comes out of a program has none.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from jaxhom import checks
 
 Names = tuple[Hashable, ...]
+_PLAIN = (int, str)  # what most names are made of
 
 
 def check_names(argument: str, names: Iterable[Hashable] | None, count: int) -> Names | None:
@@ -29,11 +30,20 @@ def check_names(argument: str, names: Iterable[Hashable] | None, count: int) -> 
     listed = names.tolist() if isinstance(names, np.ndarray) else names
     if isinstance(listed, str) or not isinstance(listed, Iterable):
         raise ValueError(f"{argument} must be a sequence of names, got {checks.in_one_line(names)}")
-    found = tuple(tuple(name) if isinstance(names, np.ndarray) and isinstance(name, list) else name for name in listed)
+    is_array = isinstance(names, np.ndarray)
+    found = tuple(_of_python(tuple(name) if is_array and isinstance(name, list) else name) for name in listed)
     if len(found) != count:
         raise ValueError(f"{argument} must be {count} names, got {len(found)}")
     numbers_of(argument, found)
     return found
+
+
+def _of_python(name: Any) -> Any:
+    """A name without NumPy's types, which nobody writes and no file gives back: `3` for `np.int64(3)`."""
+    if type(name) is tuple:
+        return tuple([part if type(part) in _PLAIN else _of_python(part) for part in name])
+    is_scalar = isinstance(name, np.generic) and isinstance(name, np.number | np.bool_ | np.str_ | np.bytes_)
+    return name.item() if is_scalar else name
 
 
 def numbers_of(argument: str, names: Names) -> dict[Hashable, int]:

@@ -16,7 +16,6 @@ from typing import Any
 
 import jax
 
-from jaxhom import checks
 from jaxhom.sweeps.cases import Plain, as_columns, batched, checked_result
 from jaxhom.sweeps.provenance import LIBRARIES, versions
 
@@ -60,7 +59,7 @@ def ship(work: Callable) -> Shipped:
         return Shipped(pickler.dumps(work), jax.config.jax_enable_x64)  # type: ignore[attr-defined]
     except Exception as error:  # whatever the objects in it raise
         remark = "" if pickler is not pickle else " (with cloudpickle installed, functions of any place can)"
-        reason = checks.in_one_line(str(error))
+        reason = _in_one_line(str(error))
         raise ValueError(f"work cannot be sent to other processes: {reason}{remark}") from None
 
 
@@ -99,4 +98,8 @@ def _checked(result: Any, case: Any) -> dict[str, Plain]:
 
 
 def _failed(error: BaseException) -> dict[str, Plain]:
-    return {"error": " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST]}
+    return {"error": _in_one_line(f"{type(error).__name__}: {error}")}
+
+
+def _in_one_line(text: str) -> str:
+    return " ".join(text.split())[:_LONGEST]

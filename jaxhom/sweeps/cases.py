@@ -13,6 +13,7 @@ from jaxhom import checks
 Plain = str | int | float | bool | None
 OURS = ("case", "error", "seconds", "time", "host", "x64", "commit", "versions")
 """The columns that every row has beside those of its case and its result."""
+_MOST_BITS = 10_000  # Python neither writes nor reads numbers of more than 4300 digits
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -135,6 +136,8 @@ def _plain(place: str, value: Any) -> Plain:
         return value.name
     if value is None or isinstance(value, bool):
         return value
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:
+        raise ValueError(f"{place} is a whole number of {value.bit_length()} bits, more than a row holds")
     for kind in (str, int, float):
         if isinstance(value, kind):
             return kind(value)

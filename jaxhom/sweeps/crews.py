@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import operator
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
@@ -97,11 +99,18 @@ def _processes(count: int) -> Executor:
 
 
 def _begin(settings: dict[str, Any]) -> None:
-    """Has a new process compute as the caller does, on one core, and finish its case at Ctrl-C."""
+    """Has a new process compute as the caller does, on one core, finish its case at Ctrl-C, and end with the caller."""
+    threading.Thread(target=_end_with, args=[multiprocessing.parent_process()], daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for name, value in settings.items():
         jax.config.update(name, value)
     one_blas_thread().__enter__()
+
+
+def _end_with(caller: Any) -> None:
+    """Ends this process once another one has: who is killed tells nobody, and workers would wait for more for ever."""
+    caller.join()
+    os._exit(1)
 
 
 def _begun() -> None:

@@ -173,6 +173,18 @@ def test_large_tables_may_be_set_to_0_first(tmp_path):
     np.testing.assert_array_equal(model.mdp.next_state[..., 0], expected)
 
 
+def test_several_statements_on_a_line(tmp_path):
+    """Its readers see words and not lines; a word behind a colon is a name, `T` and `start` too."""
+    lines = ["discount: 0.9", "states: T start", "actions: O", "start: 0.25 0.75", "T: O : T : start 1.0"]
+    lines += ["T: O : start 0.5 0.5", "R: O : T : * : * 3", "R: O :start : * : * -1"]
+    one, many = (read(tmp_path, text) for text in (" ".join(lines), "\n".join(lines)))
+    for got, expected in ((one.reward, many.reward), (one.mdp.transition, many.mdp.transition)):
+        np.testing.assert_array_equal(got, expected)
+    assert one.mdp.initial.tolist() == [0.25, 0.75] and many.reward.tolist() == [[3.0], [-1.0]]
+    with pytest.raises(FileError, match=r"line 3 \(T\): no state 'd' among"):
+        read(tmp_path, f"{HEAD.replace(chr(10), ' ', 3)}T: go uniform {STAY[:-1]} T: go : c : d 1")
+
+
 def test_models_without_observations(tmp_path):
     """A `.MDP` file: rewards have no fourth field, and may be rows and matrices over next states."""
     text = "discount: 0.9\nstates: 2\nactions: 2\nT: * uniform\nR: 0 : 0 : 1 4\nR: 1 : 0\n1 3\nR: 1 : 1 : * : * 7\n"

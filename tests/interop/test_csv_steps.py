@@ -1,5 +1,6 @@
 """Trajectories and answers in text files of every kind: delimiters, names of columns, names of states, ends."""
 
+import enum
 import gzip
 import re
 import time
@@ -13,6 +14,17 @@ from jaxhom.interop.csv_answers import append_answer
 
 EXPECTED = [([0, 2, 2, 4], [1, 0, 1]), ([3, 1], [0])]  # with the states where the episodes ended
 LINES = [["x", 0, 1], ["y", 3, 0], ["x", 2, 0], ["x", 2, 1], ["y", 1, ""], ["x", 4, ""]]
+
+
+class Colour(enum.Enum):
+    RED = 1
+
+
+class Unclear:
+    """All its objects read the same."""
+
+    def __str__(self):
+        return "it"
 
 
 def named_machine():
@@ -127,6 +139,23 @@ def test_names_of_states_and_actions(read):
     lines = 'episode,state,action\n0,new,run\n0,"(0, 1)",repair\n0,"[0,1]",0\n0,2,1\n0,worn out,\n'
     demonstrations, _ = read(lines, mdp=named_machine())
     assert pairs(demonstrations) == [([0, 1, 1, 2, 2], [0, 1, 0, 1])]
+
+
+def test_tuples_of_numpy_scalars(read):
+    places = [(np.int64(0), np.float64(1.5)), (np.int64(-2), np.str_("x"))]
+    mdp = MDP.from_dense(np.eye(2)[:, None], discount=0.9, state_names=places)
+    lines = "".join(f'0,"{place}",0\n' for place in places)  # `(np.int64(0), np.float64(1.5))`
+    assert pairs(read(f"episode,state,action\n{lines}", mdp=mdp)[0]) == [([0, 1], [0, 0])]
+
+
+def test_names_that_are_objects_stand_as_python_writes_them(read):
+    names = [Colour.RED, ("a", Colour.RED), None, True, frozenset("a")]
+    mdp = MDP.from_dense(np.eye(5)[:, None], discount=0.9, state_names=names)
+    lines = "".join(f'0,"{name}",0\n' for name in names)
+    assert pairs(read(f"episode,state,action\n{lines}", mdp=mdp)[0]) == [([0, 1, 2, 3, 4], [0] * 5)]
+    unclear = mdp.replace(state_names=[Unclear() for _ in names])
+    with pytest.raises(FileError, match="line 2, column 'state': there is no state 'it'"):
+        read("episode,state,action\n0,it,0\n", mdp=unclear)
 
 
 @pytest.mark.parametrize("delimiter", [",", ", ", " "])

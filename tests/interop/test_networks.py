@@ -87,7 +87,8 @@ def test_nodes_have_positions_and_lengths():
     assert model.mdp.features[0, :, 0].tolist() == [-4, -3, -2, -1] and model.coordinates[2].tolist() == [2, 0]
     assert model.terminal.tolist() == [False, True, True, True, True]
     graph.edges["c", "n"].clear()
-    assert from_networkx(graph, discount=0.9).mdp.num_features == 0
+    some = from_networkx(graph, discount=0.9)
+    assert some.mdp.num_features == 0 and "weight ignored: 1 link without" in some.remarks
 
 
 @pytest.mark.parametrize(
@@ -123,6 +124,8 @@ LINKS = [(1, 2, 5.0), (2, 3, 1.5), (3, 1, 2.0), (2, 1, 5.0)]
 FILES = {
     "words": "# roads\n1 2 5\n2 3 1.5\n\n3 1 2\n2 1 5\n",
     "commas": "1,2,5\n2,3,1.5\n3,1,2\n2,1,5\n",
+    "comments": "% 4 links, in km\n#from,to\n1,2,5\n2,3,1.5\n # and\n3,1,2\n2,1,5\n",
+    "comments and quotes": '# roads\n"1"\t2\t5\n%\n2\t3\t1.5\n3\t1\t2\n2\t1\t5\n',
     "names": "key;length;to;from\n0;5;2;1\n0;1.5;3;2\n0;2;1;3\n0;5;1;2\n",
     "words with names": "u v weight\n1 2 5\n2 3 1.5\n3 1 2\n2 1 5\n",
 }
@@ -153,11 +156,22 @@ def test_both_directions_texts_and_several_links(tmp_path):
     assert from_edges(path, discount=0.9, states="nodes").terminal.tolist() == [False, False, True]
 
 
-@pytest.mark.parametrize("directed", [True, False])
-def test_lists_that_networkx_wrote(tmp_path, directed):
-    graph = (networkx.DiGraph if directed else networkx.Graph)([("a", "b", {"weight": 2}), ("b", "c", {"weight": 1})])
-    networkx.write_edgelist(graph, tmp_path / "roads.edgelist")
-    model = from_edges(tmp_path / "roads.edgelist", discount=0.9, directed=directed)
+def test_links_that_begin_where_they_end(tmp_path):
+    """Without direction, too, each of them is one."""
+    path = tmp_path / "roads.edgelist"
+    path.write_text("1 1 3\n1 2 5\n")
+    model = from_edges(path, discount=0.9, directed=False)
+    assert model.state_names == ((1, 1), (1, 2), (2, 1))
+    assert model.mdp.features[:, 0, 0].tolist() == [-3, -5, -5]
+
+
+@pytest.mark.parametrize("delimiter", [" ", ",", "\t", ";"])
+@pytest.mark.parametrize("kind", ["Graph", "DiGraph", "MultiGraph", "MultiDiGraph"])
+def test_lists_that_networkx_wrote(tmp_path, kind, delimiter):
+    links = [("a", "b", {"weight": 2}), ("b", "c", {"weight": 1}), *[("a", "b", {"weight": 3})] * ("Multi" in kind)]
+    graph = getattr(networkx, kind)(links)
+    networkx.write_edgelist(graph, tmp_path / "roads.edgelist", delimiter=delimiter)
+    model = from_edges(tmp_path / "roads.edgelist", discount=0.9, directed=graph.is_directed())
     expected = from_networkx(graph, discount=0.9)
     assert model.state_names == expected.state_names
     np.testing.assert_array_equal(model.mdp.features, expected.mdp.features)
@@ -181,6 +195,7 @@ def test_graphml_says_the_same(tmp_path):
         ("a.edgelist", "1 2\n3\n", "line 2: expected `from to` or `from to length`, got '3'"),
         ("a.edgelist", "1 2 3\n3 1\n", "line 2: expected 3 fields, as many as on the first line, got '3 1'"),
         ("a.edgelist", "1 2 3\n3 1 far\n", "line 2: length must be a number, got 'far'"),
+        ("a.csv", "src,dst\n1,2\n2,1\n", "line 1: 'src dst' above numbers: columns are called u or source or from; v"),
         ("a.csv", "u,v,length\n1,2,3\n1,,3\n", "line 3: a link must begin and end somewhere"),
         ("a.csv", "u,v,length\n1,2,3\n1,3\n", "line 3: expected 3 fields"),
         ("a.edgelist", "1 2 {}\n3 1 {\n", "not a readable list of links ("),

@@ -173,6 +173,8 @@ def test_observations_are_numbered_as_they_appear(observations, names):
         ({"end_state": True}, "end_state needs terminated, the transitions that ended their episode"),
         ({"states": [{1}, {2}, {3}]}, "states: no name can be made of an observation of type set"),
         ({"states": 3}, "states must be a sequence, got int"),
+        ({"states": np.array([0.5, np.nan, 1.5])}, "states[1] must not be NaN, which is equal to nothing, got nan"),
+        ({"next_states": np.array([[0, 1], [1, np.nan], [1, 2]])}, "next_states[1] must not be NaN"),
         ({"states": ["a"]}, "actions must have shape (1,) like states, got (3,)"),
         ({"states": [], "next_states": [], "actions": []}, "num_states must be at least 1, got 0"),
         ({"actions": [0, -1, 0]}, "actions[1] must not be negative, got -1"),

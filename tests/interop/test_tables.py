@@ -72,7 +72,7 @@ def test_all_forms_give_the_same_model(tmp_path, form, monkeypatch):
 def test_numbers_without_gaps_are_no_names(tmp_path, kind):
     data = numbered()
     data = data.astype({"state": kind, "action": kind, "next_state": kind})
-    for table in (data, *([] if kind is float else [written(tmp_path, data.to_csv(index=False))])):
+    for table in (data, written(tmp_path, data.to_csv(index=False))):
         model = from_table(table, discount=0.9)
         np.testing.assert_allclose(dense_transition(model.mdp), TRANSITION)
         assert model.state_names is None and model.action_names is None
@@ -82,6 +82,16 @@ def test_numbers_with_gaps_are_names_in_ascending_order():
     model = from_table({"state": [30, 7], "action": [1, 1], "next": [7, 30]}, discount=0.9)
     assert model.state_names == (7, 30) and model.action_names == (1,)
     assert model.mdp.transition[:, 0].tolist() == [[0, 1], [1, 0]] and model.reward is None
+
+
+def test_whole_numbers_are_in_the_order_of_numbers(tmp_path):
+    """Also as floats, which programs make of columns that once had gaps."""
+    rows = "".join(f"{state}.0,0,{(state + 1) % 12}.0\n" for state in range(12))
+    model = from_table(written(tmp_path, f"state,action,next\n{rows}"), discount=0.9)
+    assert model.state_names is None and model.mdp.transition[:, 0].argmax(axis=-1).tolist() == [*range(1, 12), 0]
+    for other in ("0.5", "1e300", "inf"):  # no numbers of states, but names
+        names = from_table(written(tmp_path, f"state,action,next\n0,0,{other}\n"), discount=0.9).state_names
+        assert names == ("0", other)
 
 
 def test_tables_of_the_robust_kind_and_columns_of_other_names(tmp_path):

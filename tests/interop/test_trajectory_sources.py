@@ -182,6 +182,15 @@ def test_names_of_the_model():
     assert report.dropped == ((1, "observations[1]: there is no state (0, 2); did you mean (0, 1) or (0, 0)?"),)
 
 
+@pytest.mark.parametrize("names", [[("hall", 0), ("hall", 1)], [((0, 1), "hall"), ((1, 0), "hall")], [("a", "b"), "c"]])
+def test_names_with_parts_of_several_kinds(names):
+    """An array of NumPy would hold texts in place of the numbers, or nothing at all."""
+    mdp = MDP.from_dense(np.eye(2)[:, None], discount=0.9, state_names=names)
+    table = {"run": [0, 0, 1], "obs": [names[1], names[1], names[0]], "act": [0, 0, 0]}
+    for source in (table, pandas.DataFrame(table)):
+        assert pairs(demonstrations_from(source, mdp=mdp)[0]) == [([1, 1], [0, 0]), ([0], [0])]
+
+
 def test_tables_of_states_alone():
     ring = MDP.from_dense(np.eye(3)[[[0, 1], [1, 2], [2, 0]]], discount=0.9)
     table = {"run": [0, 1, 0, 0, 1], "obs": [0, 2, 1, 1, 0], "reward": [0] * 5}
@@ -207,7 +216,7 @@ def test_tables_of_states_alone():
         ),
         ({"obs": [0, 1, 2, 3], "acts": [0, 1]}, "action must have shape (4, ...) like state, T >= 1, got (2,)"),
         ({"obs": 3, "acts": [0, 1]}, "column 'state' must have shape [T, ...], got ()"),
-        ({**FLAT, "dones": [0, 0, 2, 0]}, "terminated[2] must be True or False, got 2"),
+        ({**FLAT, "dones": [0, 0, 2, 0]}, "dones[2] must be True or False, got 2"),
         ({**FLAT, "ep": [1, 1, 2, 2], "dones": [0] * 4}, "rows 2 and 3: the next state is 4, but then the state is 3"),
         ({**FLAT, "ep": [1, 1, None, 1]}, "episode[2] is missing"),
         ({**FLAT, "t": [0, 1, "x", 2]}, "step[2]: must be a whole number, got 'x'"),
@@ -418,6 +427,20 @@ def test_hdf5_files(tmp_path):
     (tmp_path / "cut.h5").write_bytes((tmp_path / "d4rl.hdf5").read_bytes()[:100])
     with pytest.raises(FileError, match="cut.h5: not a readable HDF5 file"):
         demonstrations_from(tmp_path / "cut.h5")
+
+
+@pytest.mark.parametrize("kind", ["S", object])
+def test_texts_in_hdf5_files(tmp_path, kind):
+    """They are bytes there, of one length or of several."""
+    h5py = pytest.importorskip("h5py")
+    names = {"state_names": ["hall", "k\u00fcche"], "action_names": ["go"]}
+    mdp = MDP.from_dense(np.eye(2)[:, None], discount=0.9, **names)
+    columns = {"observations": ["k\u00fcche", "hall"], "actions": ["go", "go"]}
+    with h5py.File(tmp_path / "walks.hdf5", "w") as file:
+        for name, column in columns.items():
+            file[name] = np.array([text.encode() for text in column], kind)
+        file["timeouts"] = [False, True]
+    assert pairs(demonstrations_from(tmp_path / "walks.hdf5", mdp=mdp)[0]) == [([1, 0], [0, 0])]
 
 
 @pytest.mark.parametrize(

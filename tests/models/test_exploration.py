@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import re
 
 import jax
 import numpy as np
@@ -86,7 +87,10 @@ def test_dtypes_of_python_and_numpy_are_taken():
         ({"successors": lambda s: {"a": [(1.0, s, 0.0)]}}, "outcomes must be a list of pairs .* among them"),
         ({"successors": lambda s: ["a"]}, r"successors\('x'\) must be a mapping from actions to outcomes"),
         ({"successors": lambda s: None}, "there are no actions"),
-        ({"successors": lambda s: {"a": [(1.0, s + "x")]}, "max_states": 9}, "more than 9 states can be reached"),
+        (
+            {"successors": lambda s: {"a": [(1.0, s + "x")]}, "max_states": 3},
+            "more than 3 states can be reached, 'xxxx' the last of them: pass a larger max_states",
+        ),
         ({"max_states": 0}, "max_states must be at least 1"),
         ({"actions": ["b"]}, r"action 'a': not one of the given actions \['b'\]"),
         ({"actions": ["a", "a"]}, r"actions\[1\] must be new, got 'a' again, as \[0\]"),
@@ -114,6 +118,9 @@ def test_errors_of_the_function_say_where():
     with pytest.raises(ZeroDivisionError) as caught:
         MDP.from_function(lambda s: {"a": [(1 / (2 - s), s + 1)]}, 1, discount=0.9)
     assert caught.value.__notes__ == ["in successors(2)"]
+    with pytest.raises(ZeroDivisionError) as caught:
+        MDP.from_function(lambda s: {"a": [(1.0, 2)]}, 1, discount=0.9, features=lambda s, a: [1 / (2 - s)])
+    assert caught.value.__notes__ == ["in features(2, 'a')"]
 
 
 def named(**names):
@@ -128,6 +135,14 @@ def test_names_stay_with_the_model_on_the_host():
     assert mdp.replace(state_names=None).state_names is None
     assert named(state_names=np.array([[0, 1], [2, 3]])).state_names == ((0, 1), (2, 3))
     assert jax.jit(lambda model: model)(mdp).state_names is None  # what a program returns has none
+
+
+def test_names_are_of_python_whatever_they_came_as():
+    """What NumPy makes reads `np.int64(3)` in a text, and a file gives it back as one."""
+    mdp = named(state_names=[(np.int64(0), (np.str_("door"),)), np.float64(0.5)], action_names=np.array(["go"]))
+    assert repr((mdp.state_names, mdp.action_names)) == "(((0, ('door',)), 0.5), ('go',))"
+    assert mdp.state_index(np.float64(0.5)) == 1 == mdp.state_index(0.5)
+    assert repr(mdp.replace(state_names=np.arange(2, dtype=np.int32)[::-1].copy()).state_names) == "(1, 0)"
 
 
 def test_models_that_differ_in_names_share_programs():
@@ -193,3 +208,31 @@ def test_texts_use_names():
     jump = jaxhom.Demonstrations.from_trajectories([([0, 15], [0, 0])])
     with pytest.raises(ValueError, match=r"state 0 \(0, 0\), action 0 'up', then state 15 \(3, 3\)"):
         jump.validate(mdp)
+
+
+@pytest.mark.parametrize(
+    ("fail", "message"),
+    [
+        (lambda mdp: jaxhom.policy_value(mdp, [[1, 0], [0.5, 0.4]], [[0, 0], [0, 0]]), "policy[1 'room'] must be 1,"),
+        (
+            lambda mdp: jaxhom.policy_value(mdp, [[1, 0], [2, -1]], [[0, 0], [0, 0]]),
+            "policy[1 'room', 1 'go'] must not",
+        ),
+        (
+            lambda mdp: jaxhom.feature_expectations(mdp, np.full((3, 2, 2), 0.5)),
+            "policy[0, 0 'door', 1 'go'] is an action",
+        ),
+        (lambda mdp: jaxhom.optimal_policy(mdp, [[0, 0], [0, np.nan]]), "reward[1 'room', 1 'go'] must be finite"),
+        (lambda mdp: mdp.replace(probability=0.9 * mdp.probability), "probability[0 'door', 0 'stay'] must be 1"),
+        (
+            lambda mdp: jaxhom.Demonstrations.from_trajectories([([1, 0], [1, 1])]).validate(mdp),
+            "actions[0, 1] is not allowed in its state (index: trajectory, step), got 1: action 1 'go' in state 0",
+        ),
+    ],
+)
+def test_errors_in_arrays_use_names(fail, message):
+    allowed = [[True, False], [True, True]]
+    names = {"state_names": ["door", "room"], "action_names": ["stay", "go"]}
+    mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.9, features=np.ones((2, 1)), allowed=allowed, **names)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        fail(mdp)

@@ -1,12 +1,16 @@
 """Threads, processes and executors of others: the same rows as on one core, and none lost when workers die."""
 
 import collections
+import contextlib
+import multiprocessing
 import os
 import pickle
+import queue
 import signal
 import subprocess
 import threading
 import time
+import types
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 
 import jax
@@ -249,3 +253,16 @@ def test_processes_that_do_not_start_are_no_fault_of_the_cases(tmp_path, monkeyp
     ):
         run(scaled, NUMBERS, tmp_path, executor=1)
     assert sweeps.read(tmp_path / "rows.jsonl") == []
+
+
+def test_processes_end_when_their_caller_is_killed(monkeypatch):
+    """It cannot tell them."""
+    killed, ended = threading.Event(), queue.SimpleQueue()
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: types.SimpleNamespace(join=killed.wait))
+    monkeypatch.setattr(os, "_exit", ended.put)
+    monkeypatch.setattr(crews, "one_blas_thread", contextlib.nullcontext)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    crews._begin({})
+    assert ended.empty()
+    killed.set()
+    assert ended.get(timeout=10) == 1

@@ -58,8 +58,8 @@ def work(case: dict) -> dict:
     plan = timed("planning", lambda: jaxhom.optimal_policy(mdp, reward, progress=True))
     walks = jaxhom.sample_demonstrations(jax.random.key(0), mdp, plan.policy, _DEMONSTRATIONS, 2 * size)
     general = timed("Algorithm 1", lambda: jaxhom.soft_local_homomorphism(mdp, walks, progress=True))
-    timed("k-NN", lambda: jaxhom.nearest_neighbors(mdp, walks))
-    expectations = timed("expectations", lambda: jaxhom.feature_expectations(mdp, general.policy))
+    timed("k-NN", lambda: jaxhom.nearest_neighbors(mdp, walks, progress=True))
+    expectations = timed("expectations", lambda: jaxhom.feature_expectations(mdp, general.policy, progress=True))
     bound = timed("loss bound", lambda: jaxhom.loss_bound(mdp, walks, general, progress=True))
     return found | {
         "states": mdp.num_states,

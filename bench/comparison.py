@@ -11,6 +11,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import pandas as pd
 
+from bench.figures import domain_name
+from bench.methods import CONTROLS
 from bench.rows import Row
 from bench.summaries import (
     AGREES,
@@ -86,6 +88,29 @@ def table1_words(cells: pd.DataFrame, orders: Sequence[Order]) -> list[str]:
         )
         paragraphs.append(f"Not reproduced: {pair[0]} above {pair[1]}. {listed}.")
     return [text for text in paragraphs if text]
+
+
+def control_words(rows: Iterable[Row]) -> str:
+    """What is earned without any demonstration, domain by domain over its settings; empty without such rows."""
+    found = frame(rows)
+    found = found[found["method"].isin(CONTROLS)]
+    parts = []
+    for (domain,), group in grouped(found, "domain"):
+        means = 100.0 * group.pivot_table("ratio", ["regions", "demonstrations"], "method", observed=True)
+        zeros, uniform = (_range(means[name]) if name in means else "no rows" for name in ("lpal_zeros", "uniform"))
+        parts.append(f"{domain_name(domain)}: {zeros} and {uniform}")
+    listed = "; ".join(parts)
+    return (
+        "Controls, fed with no demonstration at all, in percent of the expert's reward: LPAL fed with zeros, and a "
+        f"uniform policy. {listed}."
+        if parts
+        else ""
+    )
+
+
+def _range(values: pd.Series) -> str:
+    low, high = f"{values.min():.1f}", f"{values.max():.1f}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _cell_words(method: str, cells: pd.DataFrame) -> str:

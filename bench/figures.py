@@ -17,6 +17,8 @@ from jaxhom.plotting import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 _GREY = "#777777"
 STYLES = {
     "expert": ("expert", BLACK, "", "-"),
+    "uniform": ("uniform policy", "#BBBBBB", "", "--"),
+    "lpal_zeros": ("LPAL fed with zeros", BLACK, "1", ":"),
     "lpal_full_policy": ("LPAL with the complete policy", _GREY, "x", ":"),
     "soft_local_homomorphism": ("soft local homomorphism (anchored)", VERMILLION, "o", "-"),
     "soft_local_homomorphism_mutual": ("soft local homomorphism, both directions", ORANGE, "^", "--"),

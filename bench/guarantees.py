@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxhom
-from bench.learners import learned, uniform
-from bench.methods import Learned, Method, expert, manhattan_knn, soft
+from bench.learners import learned
+from bench.methods import Learned, Method, expert, manhattan_knn, soft, uniform
 from bench.problems import Problem
 
 _POLICIES: dict[str, Method] = {

@@ -13,20 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxhom
-from bench.methods import Learned, Method, apprentice, expert, manhattan_knn, monte_carlo, soft
+from bench.methods import (
+    Learned,
+    Method,
+    apprentice,
+    expert,
+    manhattan_knn,
+    monte_carlo,
+    nothing_fed,
+    soft,
+    uniform,
+)
 from bench.problems import Problem
-from bench.relations import nothing_fed
 from jaxhom import MDP, Demonstrations
 
 _ROUNDS = 100  # of projection and MWAL
-
-
-def uniform(problem: Problem) -> Learned:
-    """Every action alike, everywhere: what no demonstration is worth."""
-    mdp = problem.domain.mdp
-    policy = np.asarray(mdp.allowed, float)
-    policy /= policy.sum(axis=1, keepdims=True)
-    return Learned(jnp.broadcast_to(policy, (len(problem.draws), *policy.shape)))
 
 
 def equal_weights(problem: Problem) -> Learned:
@@ -90,15 +91,14 @@ _projection = functools.partial(jaxhom.projection, max_iterations=_ROUNDS)
 _mwal = functools.partial(jaxhom.mwal, max_iterations=_ROUNDS)
 _inverse_lp = functools.partial(jaxhom.inverse_lp, nonnegative=True)
 
-CONTROLS: dict[str, Method] = {
+FED_WITH_NOTHING: dict[str, Method] = {
     "uniform": uniform,
     "best for equal weights": equal_weights,
     "LPAL, zeros": nothing_fed,
 }
-"""What is fed with nothing."""
 LEARNERS: dict[str, Method] = {
     "expert": expert,
-    **CONTROLS,
+    **FED_WITH_NOTHING,
     "k-NN": manhattan_knn,
     "Algorithm 1": soft,
     "max. causal entropy": learned(jaxhom.max_causal_entropy),

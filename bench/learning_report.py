@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from bench import tables
 from bench.figures import domain_name, draw_curve, panels_of, pick, with_legend
 from bench.guarantees import LEAST, TRUE, WORST
-from bench.learners import CONTROLS
+from bench.learners import FED_WITH_NOTHING
 from bench.queries import ROUNDS
 from bench.rows import Row
 from bench.settings import QUESTIONS_PER_ROUND
@@ -51,7 +51,7 @@ _LOSSES = {
 }
 _LEAST_SHOWN = 1e-4  # loss per step, on a logarithmic scale
 _KINDS = {
-    "no demonstration": tuple(CONTROLS),
+    "no demonstration": tuple(FED_WITH_NOTHING),
     "generalization": ("k-NN", "Algorithm 1"),
     "max. causal entropy": ("max. causal entropy",),
     "LPAL": ("LPAL, Algorithm 1", "LPAL, Monte Carlo"),

@@ -94,6 +94,14 @@ euclidean_knn = generalize(
 regression = generalize(jaxhom.occupancy_regression)
 
 
+def uniform(problem: Problem) -> Learned:
+    """Every action alike, everywhere: what no demonstration is worth."""
+    mdp = problem.domain.mdp
+    policy = np.asarray(mdp.allowed, float)
+    policy /= policy.sum(axis=1, keepdims=True)
+    return Learned(jnp.broadcast_to(policy, (len(problem.draws), *policy.shape)))
+
+
 def apprentice(method: Method) -> Method:
     """LPAL on the feature expectations of a method's policies, started from them."""
 
@@ -131,13 +139,23 @@ def monte_carlo(problem: Problem, *, per_step: bool = False) -> Learned:
     return of_solution(mdp, jaxhom.lpal(mdp, found / (problem.setting.length if per_step else 1), **options))
 
 
+def nothing_fed(problem: Problem) -> Learned:
+    """The control of LPAL: fed with zeros, once for all draws."""
+    mdp = problem.domain.mdp
+    solution = jaxhom.lpal(mdp, jnp.zeros((1, mdp.num_features)))
+    return of_solution(mdp, jax.tree.map(lambda leaf: jnp.repeat(leaf, len(problem.draws), axis=0), solution))
+
+
 def of_solution(mdp, solution) -> Learned:
     gap = jnp.maximum(solution.margin_bound - solution.margin, 0.0) * (1.0 - mdp.discount)
     return Learned(solution.policy, np.asarray(solution.status), np.asarray(gap))
 
 
+CONTROLS: dict[str, Method] = {"uniform": uniform, "lpal_zeros": nothing_fed}
+"""What is fed with nothing, beside every sweep with LPAL."""
 TABLE1: dict[str, Method] = {
     "expert": expert,
+    **CONTROLS,
     "full_policy": full_policy,
     "soft_local_homomorphism": apprentice(soft),
     "monte_carlo": monte_carlo,
@@ -146,10 +164,11 @@ TABLE1: dict[str, Method] = {
     "regression": apprentice(regression),
     "manhattan_knn": apprentice(manhattan_knn),
 }
-"""The columns of Table I, under the names of its file."""
+"""The columns of Table I, under the names of its file, and the controls."""
 THRESHOLD: dict[str, Method] = {"expert": expert, "soft_local_homomorphism": soft, "manhattan_knn": manhattan_knn}
 FIGURE1: dict[str, Method] = {
     "expert": expert,
+    **CONTROLS,
     "lpal_full_policy": full_policy,
     "soft_local_homomorphism": soft,
     "soft_local_homomorphism_printed": functools.partial(soft, anchored=False),
@@ -159,8 +178,9 @@ FIGURE1: dict[str, Method] = {
     "lpal_manhattan_knn": apprentice(manhattan_knn),
 }
 """The curves of Figure 1; Algorithm 1 also with the program as printed, and asking for similarity both ways."""
-ENOUGH: dict[str, Method] = {**THRESHOLD, "maximum_entropy": maximum_entropy, "monte_carlo": monte_carlo}
+ENOUGH: dict[str, Method] = {**THRESHOLD, **CONTROLS, "maximum_entropy": maximum_entropy, "monte_carlo": monte_carlo}
 NORMALISATION: dict[str, Method] = {
+    **CONTROLS,
     "monte_carlo": monte_carlo,
     "monte_carlo_per_step": functools.partial(monte_carlo, per_step=True),
 }

@@ -10,12 +10,21 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxhom
-from bench.methods import Learned, Method, expert, manhattan_knn, maximum_entropy, of_solution, shared_table, soft
+from bench.methods import (
+    Learned,
+    Method,
+    expert,
+    manhattan_knn,
+    maximum_entropy,
+    nothing_fed,
+    shared_table,
+    soft,
+    uniform,
+)
 from bench.problems import Problem, build_domain, draw_problem
 from bench.settings import track
 from jaxhom.generalization.choice import default_candidates
@@ -97,13 +106,6 @@ def _union(relation: str) -> tuple[Any, jaxhom.SimilarityTable]:
     return union, jaxhom.SimilarityTable(union, relation=relation)
 
 
-def nothing_fed(problem: Problem) -> Learned:
-    """The control of LPAL: fed with zeros."""
-    mdp = problem.domain.mdp
-    solution = jaxhom.lpal(mdp, jnp.zeros((1, mdp.num_features)))
-    return of_solution(mdp, jax.tree.map(lambda leaf: jnp.repeat(leaf, len(problem.draws), axis=0), solution))
-
-
 def _methods(chosen_ones: Mapping[str, Mapping[str, Any]], **more) -> dict[str, Method]:
     suffix = _LABELS if more.get("is_labelled") else ""
     return {name + suffix: functools.partial(related, **options, **more) for name, options in chosen_ones.items()}
@@ -115,7 +117,7 @@ def _choices(**options) -> dict[str, Method]:
     return {"chosen": careful, "chosen, highest score": bold}
 
 
-_CONTROLS: dict[str, Method] = {"expert": expert, "uniform": maximum_entropy, "k-NN": manhattan_knn}
+_CONTROLS: dict[str, Method] = {"expert": expert, "uniform elsewhere": maximum_entropy, "k-NN": manhattan_knn}
 WITHOUT_LABELS: dict[str, Method] = {**_CONTROLS, **_methods(_RELATIONS), **_methods(_VOTERS), **_choices()}
 """On models without labels."""
 WITH_LABELS: dict[str, Method] = {
@@ -135,9 +137,9 @@ CANDIDATES = {
 """What is chosen from, but for the expert; by sweep."""
 ACROSS: dict[str, Method] = {
     "expert": expert,
-    "uniform": lambda problem: Learned(jnp.full_like(problem.expert.policy, 1.0 / problem.expert.policy.shape[-1])),
+    "uniform": uniform,
     "k-NN": functools.partial(across, method="k-NN"),
-    "LPAL fed with zeros": nothing_fed,
+    "LPAL, zeros": nothing_fed,
     **{name: functools.partial(across, **options) for name, options in _RELATIONS.items()},
 }
 """From one model to another."""

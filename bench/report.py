@@ -81,6 +81,7 @@ def _table1(rows: list[Row], folder: pathlib.Path) -> str:
             "outside our interval, * where it is out of reach of single draws and of the noise of 1000 trials, too:",
             tables.to_markdown(*ratio),
             *comparison.table1_words(cells, comparison.compare_orders(rows)),
+            comparison.control_words(rows),
         ]
     )
     (folder / "table1.md").write_text(markdown + "\n")
@@ -99,7 +100,8 @@ def _figure1(rows: list[Row], folder: pathlib.Path) -> str:
             "in any metric of any draw."
         )
     listed = "\n".join(f"- {sentence}" for sentence in words)
-    return f"## Figure 1\n\n{_health(rows)}\n\n![Figure 1](figure1.png)\n\n{_FIGURE1_NOTE}\n\n{listed}"
+    controls = comparison.control_words(rows)
+    return f"## Figure 1\n\n{_health(rows)}\n\n![Figure 1](figure1.png)\n\n{_FIGURE1_NOTE}\n\n{listed}\n\n{controls}"
 
 
 def _question(name: str, title: str, draw: Callable, more: Callable[[pd.DataFrame], str] | None = None) -> Callable:

@@ -8,14 +8,13 @@ cluster compute, in a checkout like this one. `python -m bench.report` turns row
 import argparse
 import contextlib
 import dataclasses
-import pathlib
 import sys
 from collections.abc import Iterator, Sequence
 
 import jax
 
 from bench import guarantees, learners, methods, queries, relations, settings, summaries, sweep
-from bench.provenance import RESULTS
+from bench.provenance import add_output, require_clean
 from bench.rows import RowFile
 from bench.sweep import Sweep
 from jaxhom import programs
@@ -43,7 +42,8 @@ SWEEPS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code: 0 done, 1 some rows failed, 2 wrong input, 130 stopped."""
-    options = parser().parse_args(arguments)
+    options = (command := parser()).parse_args(arguments)
+    require_clean(command, options)
     jax.config.update("jax_enable_x64", True)
     programs.keep_programs()
     try:
@@ -139,7 +139,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--retry", action="store_true", help="compute rows that failed once more")
     made.add_argument("--scheduler", help="address of a Dask scheduler whose workers compute: tcp://host:8786")
     made.add_argument("--workers", type=int, help="batches at a time (default: 2 threads, or all of a cluster)")
-    made.add_argument("--output", type=pathlib.Path, default=RESULTS, help="folder (default bench/results)")
+    add_output(made)
     return made
 
 

@@ -21,7 +21,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
-from bench.provenance import RESULTS
+from bench.provenance import add_output, require_clean
 from jaxhom import sweeps
 
 GRIDS = (16, 32, 64, 128, 256, 512, 1000)
@@ -114,13 +114,14 @@ def figure(rows: list[dict], path: pathlib.Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; 0, or 1 if a model failed."""
-    options = parser().parse_args(arguments)
+    options = (command := parser()).parse_args(arguments)
     file = options.output / "scale.jsonl"
     if options.figure:
         rows = sweeps.read(file)
         figure(rows, options.figure)
         print(tables(rows))
         return 0
+    require_clean(command, options)
     kinds = (("grid", GRIDS), ("roads", ROADS))
     cases = [{"kind": kind, "size": size} for kind, sizes in kinds for size in sizes if size <= options.largest]
     # A process per model: what the one before compiled and allocated is gone.
@@ -135,7 +136,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="python -m bench.scale", description=__doc__.splitlines()[0])
     made.add_argument("--largest", type=int, default=1000, help="largest side of a grid (default 1000)")
     made.add_argument("--figure", type=pathlib.Path, help="only draw the rows, to this file, and print the table")
-    made.add_argument("--output", type=pathlib.Path, default=RESULTS, help="folder (default bench/results)")
+    add_output(made)
     return made
 
 

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 
 from bench import first_report, speed_report
 from bench.processes import NoAnswer, Worker
-from bench.provenance import RESULTS
+from bench.provenance import RESULTS, add_output, require_clean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,12 +202,15 @@ def main() -> None:
         command.add_argument("--quick", action="store_true", help="a few small instances, to see that it runs")
         command.add_argument("--sections", nargs="+", choices=kind.sections, help="only these; rows of others stay")
         command.add_argument("--report", action="store_true", help="table and figure from the rows on disk")
-        command.add_argument("--output", type=pathlib.Path, default=RESULTS / f"speed_{name}.csv")
+        add_output(command, RESULTS / f"speed_{name}.csv")
         command.set_defaults(methods=None, limit=None)
         if kind.has_methods:
             command.add_argument("--methods", nargs="+", help="only those whose names begin so; rows of others stay")
             command.add_argument("--limit", type=float, help="seconds that a measurement may take")
-    run(parser.parse_args())
+    options = parser.parse_args()
+    if not options.report:
+        require_clean(parser, options)
+    run(options)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 import jaxhom
-from bench.provenance import RESULTS, provenance
+from bench.provenance import add_output, provenance, require_clean
 from jaxhom import sweeps
 
 EXECUTORS = ("this process", "threads", "processes", "Dask")
@@ -105,8 +105,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     made.add_argument("--executors", nargs="+", choices=EXECUTORS, default=EXECUTORS, help="only these")
     made.add_argument("--workers", type=int, nargs="+", default=list(WORKERS), help="how many (default: 1 2 4)")
     made.add_argument("--share", type=float, default=1.0, help="of the cases, for a quick look")
-    made.add_argument("--output", type=pathlib.Path, default=RESULTS, help="folder (default bench/results)")
+    add_output(made)
     options = made.parse_args(arguments)
+    require_clean(made, options)
     jax.config.update("jax_enable_x64", True)
     options.output.mkdir(parents=True, exist_ok=True)
     lines = []

@@ -15,6 +15,8 @@ HEADINGS = {
     "euclidean_knn": "Euclidean k-NN",
     "regression": "regression",
     "manhattan_knn": "Manhattan k-NN",
+    "lpal_zeros": "zeros",
+    "uniform": "uniform policy",
 }
 _MARKS = {DIFFERS: "*", ONE_DRAW: "†"}
 Table = tuple[list[str], list[list[str]]]  # header and rows

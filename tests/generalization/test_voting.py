@@ -40,6 +40,14 @@ def world(name):
     return mdp, demonstrations, rng.integers(0, 2, (12, 3, 1)) * 0.25
 
 
+@functools.cache
+def table_of(name, relation, *, is_labelled=False, label_weight=1.0):
+    """A table that the tests share: what one of them has solved the others need not."""
+    mdp, _, labels = world(name)
+    options = {"labels": labels, "label_weight": label_weight} if is_labelled else {}
+    return SimilarityTable(mdp, relation=relation, **options)
+
+
 def by_brute_force(mdp, demonstrations, table, *, threshold=0.0, mutual=False, voters="nearest", weight=None):
     """(policy, radius, support), voter by voter, from the errors and renamings of a table."""
     transition, allowed = dense_transition(mdp), np.asarray(mdp.allowed)
@@ -50,16 +58,18 @@ def by_brute_force(mdp, demonstrations, table, *, threshold=0.0, mutual=False, v
     policy = np.where(visited[:, None], empirical, uniform)
     radius, support = np.where(visited, 0, -1), visited.astype(int)
 
+    pairs = np.array([(s, expert) for s in np.flatnonzero(~visited) for expert in decides]).T
+    upper, renamings = np.asarray(table.brackets(*pairs).upper), table.renamings(*pairs)
+    if mutual:
+        upper = np.maximum(upper, table.brackets(*pairs[::-1]).upper)
+    number = {(int(s), int(expert)): place for place, (s, expert) in enumerate(pairs.T)}
+
     def ballot(s, expert):
-        pairs = [(s, expert), (expert, s)][: 1 + mutual]
-        error = max(float(table.brackets([a], [b]).upper[0]) for a, b in pairs)
-        if error > threshold + 1e-4:
+        place = number[int(s), int(expert)]
+        if upper[place] > threshold + 1e-4:
             return np.zeros(num_actions)
-        votes = empirical[expert]
-        renamings = table.renamings([s], [expert])
-        if renamings is not None:
-            votes = votes[renamings[0]]
-        return votes * allowed[s] * (1.0 if weight is None else weight(error))
+        votes = empirical[expert] if renamings is None else empirical[expert][renamings[place]]
+        return votes * allowed[s] * (1.0 if weight is None else weight(float(upper[place])))
 
     for s in np.flatnonzero(~visited):
         within, found = {int(s)}, {}
@@ -85,7 +95,7 @@ def by_brute_force(mdp, demonstrations, table, *, threshold=0.0, mutual=False, v
 @pytest.mark.filterwarnings("ignore::jaxhom.ImpossibleStepsWarning")
 def test_who_votes(name, relation, options):
     mdp, demonstrations, _ = world(name)
-    table = SimilarityTable(mdp, relation=relation)
+    table = table_of(name, relation)
     general = soft_local_homomorphism(mdp, demonstrations, relation=relation, table=table, **options)
     policy, radius, support = by_brute_force(mdp, demonstrations, table, **options)
     np.testing.assert_array_equal(general.radius, radius)
@@ -101,7 +111,7 @@ def test_who_votes(name, relation, options):
 def test_weights_and_labels(name, relation, voters):
     mdp, demonstrations, labels = world(name)
     options = {"labels": labels, "label_weight": 2.0, "relation": relation}
-    table = SimilarityTable(mdp, **options)
+    table = table_of(name, relation, is_labelled=True, label_weight=2.0)
     rule = {"voters": voters, "threshold": 0.45, "weights": "similarity", "temperature": 0.2}
     general = soft_local_homomorphism(mdp, demonstrations, table=table, **options, **rule)
     weight = lambda error: np.exp(-error / 0.2)  # noqa: E731
@@ -128,9 +138,9 @@ def test_weights_and_labels(name, relation, voters):
 @pytest.mark.filterwarnings("ignore::jaxhom.ImpossibleStepsWarning")
 def test_the_same_inside_programs(name, options):
     mdp, demonstrations, labels = world(name)
-    kind = {"labels": labels, "relation": options.get("relation", "homomorphism")}
     weighted = options.get("weights") == "similarity"
-    table = SimilarityTable(mdp, **kind).complete(options.get("threshold", 0.0), with_errors=weighted)
+    table = table_of(name, options.get("relation", "homomorphism"), is_labelled=True)
+    table.complete(options.get("threshold", 0.0), with_errors=weighted)
     learn = functools.partial(soft_local_homomorphism, mdp, labels=labels, table=table, **options)
     inside, outside = jax.jit(learn)(demonstrations), learn(demonstrations)
     np.testing.assert_array_equal(inside.radius, outside.radius)
@@ -158,7 +168,8 @@ def test_weights_inside_programs_need_errors():
 @pytest.mark.filterwarnings("ignore::jaxhom.ImpossibleStepsWarning")
 def test_explanations_add_up(name, relation, rule):
     mdp, demonstrations, labels = world(name)
-    general = soft_local_homomorphism(mdp, demonstrations, relation=relation, labels=labels, **rule)
+    table = table_of(name, relation, is_labelled=True)
+    general = soft_local_homomorphism(mdp, demonstrations, relation=relation, labels=labels, table=table, **rule)
     for state in range(mdp.num_states):
         why = general.explain(state)
         assert len(why.voters) == general.support[state]
@@ -233,15 +244,21 @@ def test_everybody_at_an_infinite_threshold():
     assert weighed[0] > 0 and np.allclose(np.asarray(general.policy).sum(axis=1), 1.0)
 
 
+@functools.cache
+def completed(dtype):
+    """A model whose states all differ, and a table of all its errors."""
+    transition = oracles.random_mdp(np.random.default_rng(0), 12, 2, N=2)[0].astype(dtype)
+    mdp = MDP.from_dense(transition, discount=0.9)
+    return mdp, SimilarityTable(mdp).complete(1.0, with_errors=True, tolerance=1e-3)
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("voters", ["nearest", 2, "all"])
 @pytest.mark.parametrize("temperature", [1e-5, 1e-3, 1e3])
 def test_weights_never_vanish(dtype, voters, temperature):
     """However low the temperature: the most similar voter decides, on the host and inside programs."""
-    transition = oracles.random_mdp(np.random.default_rng(0), 12, 2, N=2)[0].astype(dtype)
-    mdp = MDP.from_dense(transition, discount=0.9)
+    mdp, table = completed(dtype)
     shown = Demonstrations.from_trajectories([([0, 1, 2], [0, 1, 0])])
-    table = SimilarityTable(mdp).complete(1.0, with_errors=True, tolerance=1e-3)
     rule = {"threshold": 1.0, "voters": voters, "weights": "similarity", "temperature": temperature, "tolerance": 1e-3}
     learn = functools.partial(soft_local_homomorphism, mdp, table=table, **rule)
     with pytest.warns(UserWarning):

@@ -7,6 +7,7 @@ of which our sampled rows tell), its one draw (our draws say how much they scatt
 import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -221,9 +222,27 @@ def largest_difference(rows: Iterable[Row], track: str, one: str, other: str) ->
     return float(np.nanmax(np.concatenate(gaps))) if all(gap.size for gap in gaps) else np.nan
 
 
-def choice_words(rows: Iterable[Row], chooser: str, chosen_from: Sequence[str]) -> list[str]:
-    """For every setting, how far the choice is below the candidate with the best mean, in points, in its draws."""
-    words, behind, differences = [], 0, []
+class ChoiceGap(NamedTuple):
+    """How far a choice is from the candidate with the best mean in one setting, in points, in the choice's draws.
+
+    Attributes:
+      own: mean of the choice. best: the candidate's name; its_own: its interval. ahead: of choice - candidate.
+      is_behind: by more than one interval.
+    """
+
+    domain: str
+    demonstrations: int
+    draws: int
+    own: float
+    best: str
+    its_own: Interval
+    ahead: Interval
+    is_behind: bool
+
+
+def choice_gaps(rows: Iterable[Row], chooser: str, chosen_from: Sequence[str]) -> list[ChoiceGap]:
+    """For every setting that the chooser has rows of."""
+    gaps = []
     for (domain, count), group in grouped(frame(rows), "domain", "demonstrations"):
         ratios = 100.0 * group.pivot(index="draw", columns="method", values="ratio")
         if chooser not in ratios:  # its rows failed, or were not asked for
@@ -233,13 +252,19 @@ def choice_words(rows: Iterable[Row], chooser: str, chosen_from: Sequence[str]) 
         best = candidates.mean().idxmax()
         own, ahead = mean_interval(candidates[best]), mean_interval((ratios[chooser] - candidates[best]).dropna())
         is_behind = ahead.high < 0.0 and ahead.mean < -own.half_width
-        behind += is_behind
-        differences.append(ahead.mean)
-        verdict = "behind by more than one interval" if is_behind else "within one interval"
-        words.append(
-            f"{domain}, {count} demonstrations, {len(ratios)} draws: {ratios[chooser].mean():.1f} against "
-            f"{own.mean:.1f} +- {own.half_width:.1f} of {best}, "
-            f"{ahead.mean:+.1f} ({ahead.low:+.1f} to {ahead.high:+.1f}): {verdict}."
-        )
-    average = f"{np.mean(differences):+.1f} points on average" if words else "none has rows"
-    return [f"{behind} of {len(words)} settings are behind by more than one interval; {average}.", *words]
+        gaps.append(ChoiceGap(domain, count, len(ratios), ratios[chooser].mean(), best, own, ahead, is_behind))
+    return gaps
+
+
+def choice_words(gaps: Sequence[ChoiceGap]) -> list[str]:
+    """How often and how far a choice is behind, then a sentence per setting."""
+    words = [
+        f"{gap.domain}, {gap.demonstrations} demonstrations, {gap.draws} draws: {gap.own:.1f} against "
+        f"{gap.its_own.mean:.1f} +- {gap.its_own.half_width:.1f} of {gap.best}, {gap.ahead.mean:+.1f} "
+        f"({gap.ahead.low:+.1f} to {gap.ahead.high:+.1f}): "
+        f"{'behind by more than one interval' if gap.is_behind else 'within one interval'}."
+        for gap in gaps
+    ]
+    average = f"{np.mean([gap.ahead.mean for gap in gaps]):+.1f} points on average" if gaps else "none has rows"
+    behind = sum(gap.is_behind for gap in gaps)
+    return [f"{behind} of {len(gaps)} settings are behind by more than one interval; {average}.", *words]

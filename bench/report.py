@@ -1,7 +1,7 @@
 """Turns rows into tables, figures and words: `python -m bench.report`. Nothing is computed but means over rows.
 
 Reads `<results>/raw/*.csv`; writes summaries (CSV), Table I (Markdown and LaTeX), figures (PNG and SVG), and all of it
-in `report.md`.
+in `report.md`. Says which figures that the README and the docs quote are out of date (`bench.quotations`).
 """
 
 import argparse
@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import matplotlib
 import pandas as pd
 
-from bench import comparison, figures, learning_report, relations, summaries, tables
+from bench import comparison, figures, learning_report, quotations, relations, summaries, tables
 from bench.provenance import RESULTS
 from bench.rows import Row, read_rows
 from bench.summaries import CONFIDENCE
@@ -60,6 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     (folder / "report.md").write_text("\n\n".join([_HEAD, *parts]) + "\n")
     print(folder / "report.md")
+    for line in quotations.stale(folder) if folder.resolve() == RESULTS else []:
+        print(f"out of date: {line}", file=sys.stderr)
     return 0
 
 
@@ -74,7 +76,8 @@ def _table1(rows: list[Row], folder: pathlib.Path) -> str:
     cells = summaries.write("table1", rows, folder)
     reward, ratio = tables.table1_reward(cells), tables.table1_ratio(cells)
     markdown = "\n\n".join(
-        [
+        part
+        for part in [
             f"## Table I\n\n{_health(rows)}\n\nAverage reward per step ± half its interval (printed in the paper):",
             tables.to_markdown(*reward),
             "Percent of the expert's reward in the same draw (of the printed expert's); † where the paper's number is "
@@ -83,6 +86,7 @@ def _table1(rows: list[Row], folder: pathlib.Path) -> str:
             *comparison.table1_words(cells, comparison.compare_orders(rows)),
             comparison.control_words(rows),
         ]
+        if part
     )
     (folder / "table1.md").write_text(markdown + "\n")
     (folder / "table1.tex").write_text(tables.to_latex(*reward) + "\n" + tables.to_latex(*ratio))
@@ -101,7 +105,8 @@ def _figure1(rows: list[Row], folder: pathlib.Path) -> str:
         )
     listed = "\n".join(f"- {sentence}" for sentence in words)
     controls = comparison.control_words(rows)
-    return f"## Figure 1\n\n{_health(rows)}\n\n![Figure 1](figure1.png)\n\n{_FIGURE1_NOTE}\n\n{listed}\n\n{controls}"
+    parts = ["## Figure 1", _health(rows), "![Figure 1](figure1.png)", _FIGURE1_NOTE, listed, controls]
+    return "\n\n".join(part for part in parts if part)
 
 
 def _question(name: str, title: str, draw: Callable, more: Callable[[pd.DataFrame], str] | None = None) -> Callable:
@@ -148,7 +153,7 @@ def _compared(name: str, title: str, note: str) -> Callable:
         if name not in relations.CANDIDATES:
             return text
         for chooser in ("chosen", "chosen, highest score"):
-            words = comparison.choice_words(rows, chooser, relations.CANDIDATES[name])
+            words = comparison.choice_words(comparison.choice_gaps(rows, chooser, relations.CANDIDATES[name]))
             text += "\n".join([f"\n\n`{chooser}`:\n", *(f"- {sentence}" for sentence in words)])
         return text
 

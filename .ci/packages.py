@@ -1,6 +1,6 @@
 """Builds the source distribution and from it the wheel, and looks at both: what has to be inside is, and it imports.
 
-`python .ci/packages.py`, in an environment with the extra `test`.
+`python .ci/packages.py FOLDER`, in an environment with the extra `test`, leaves both in the folder.
 """
 
 import os
@@ -17,12 +17,13 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 
 def main() -> None:
     """Raises where a distribution lacks something, or has too much."""
-    with tempfile.TemporaryDirectory() as folder:
-        run([sys.executable, "-m", "build", "--outdir", folder, ROOT], ROOT, os.environ)
-        (wheel,) = pathlib.Path(folder).glob("*.whl")
-        (source,) = pathlib.Path(folder).glob("*.tar.gz")
-        check_wheel(wheel)
-        check_source(source, pathlib.Path(folder) / "unpacked")
+    folder = pathlib.Path(sys.argv[1])
+    run([sys.executable, "-m", "build", "--outdir", folder, ROOT], ROOT, os.environ)
+    (wheel,) = folder.glob("*.whl")
+    (source,) = folder.glob("*.tar.gz")
+    check_wheel(wheel)
+    with tempfile.TemporaryDirectory() as unpacked:
+        check_source(source, pathlib.Path(unpacked))
 
 
 def check_wheel(path: pathlib.Path) -> None:

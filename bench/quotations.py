@@ -211,9 +211,8 @@ def _queries(folder: pathlib.Path) -> Iterator[tuple[str, str]]:
         "README.md",
         f"four rounds of 20 states take Algorithm 1 from {track[0]} to {track[1]}%, where four more demonstrations "
         f"reach {track[2]}%, and 80 states at random {track[3]}%; on the large lake from {lake[0]} to {lake[1]}%, "
-        "against "
-        f"{lake[2]} and {lake[3]}%. By their contribution to the bound states are chosen less well ({track[4]} and "
-        f"{lake[4]}%)",
+        f"against {lake[2]} and {lake[3]}%. By their contribution to the bound states are chosen less well ({track[4]} "
+        f"and {lake[4]}%)",
     )
     yield (
         "docs/which_method.md",

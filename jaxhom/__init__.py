@@ -53,7 +53,7 @@ from jaxhom.similarity.regularized_map import homomorphism_map
 from jaxhom.similarity.table import SimilarityTable
 from jaxhom.status import Status
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "LPAL",

@@ -85,6 +85,11 @@ class Record:
             return getattr(self, name)
         raise KeyError(name)
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.keys()
+
+    __iter__: Any = None  # or Python would try numbers as names
+
     def _figures(self) -> dict[str, Any]:
         """What `repr` shows, by name: the fields, unless a class knows better."""
         return {name: getattr(self, name) for name in self.keys()}

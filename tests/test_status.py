@@ -122,4 +122,7 @@ def test_records_are_frozen_pytrees_without_what_is_dropped_or_remembered():
     assert record["size"] == 2 and dict(record)["policy"] is record.policy
     with pytest.raises(KeyError):
         record["weights"]
+    assert "policy" in record and "weights" not in record
+    with pytest.raises(TypeError):
+        list(record)
     assert record == record and record != answer(size=2) and len({record, record}) == 1

@@ -44,6 +44,13 @@ def checked_expectations(mdp: MDP, expectations) -> Float[np.ndarray, "*B K"] | 
     return host
 
 
+def check_tolerance(tolerance: Any, expectations: Float[Host, "*B K"]) -> None:
+    """Raises unless a tolerance is positive, and one number or, beside expectations [B, K], one for each lane."""
+    checks.require_positive("tolerance", tolerance)
+    shapes = sorted({(), expectations.shape[:-1]})
+    checks.require_shape("tolerance", tolerance, " or ".join(map(str, shapes)), np.shape(tolerance) in shapes)
+
+
 def _largest(mdp: MDP) -> float:
     return _LARGEST * float(np.finfo(mdp.dtype).max)
 

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.arguments import check_features, checked_expectations
+from jaxhom.apprenticeship.arguments import check_features, check_tolerance, checked_expectations
 from jaxhom.apprenticeship.certificate import ExactSides
 from jaxhom.apprenticeship.exact import exact_rows, rounded_down
 from jaxhom.apprenticeship.learned import Learned
@@ -173,9 +173,7 @@ def solve_lanes(
     if tolerance is None:
         tolerance = default_tolerance(reach, batch)
     else:
-        checks.require_positive("tolerance", tolerance)
-        shapes = {(), batch.shape[:1]} if expectations.ndim == 2 else {()}
-        checks.require_shape("tolerance", tolerance, " or ".join(map(str, shapes)), np.shape(tolerance) in shapes)
+        check_tolerance(tolerance, expectations)
     tolerance = np.broadcast_to(np.asarray(tolerance, np.float64), len(batch))
     with one_blas_thread():  # matrices are small: where other work keeps cores busy, threads wait for each other
         lanes = [solve(sides, reach, batch[k], float(tolerance[k])) for k in range(len(batch))]

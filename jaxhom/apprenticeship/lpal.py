@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.arguments import check_features, checked_expectations, checked_start
+from jaxhom.apprenticeship.arguments import check_features, check_tolerance, checked_expectations, checked_start
 from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.columns import solve_by_columns
 from jaxhom.apprenticeship.in_program import ITERATIONS, solve_in_program
@@ -189,10 +189,11 @@ class LPAL:
             max_iterations = checks.require_count("max_iterations", max_iterations)
         if tolerance is not None:
             checks.refuse_traced(tolerance=tolerance)
-            checks.require_positive("tolerance", tolerance)
         given = expectations
         expectations, policy, warm_start = without_tangents((expectations, initial_policy, warm_start))
         expectations = checked_expectations(self._mdp, expectations)
+        if tolerance is not None:
+            check_tolerance(tolerance, expectations)
         batch = expectations if expectations.ndim == 2 else expectations[None]
         is_inside = self._model is None or checks.is_traced(expectations, policy, warm_start)
         if is_inside:

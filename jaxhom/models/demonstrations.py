@@ -79,6 +79,7 @@ class Demonstrations(Record):
         Args:
           trajectories: M pairs of non-empty sequences with as many states as actions, or one more: the last is then the
             state in which the episode ended, where no action was taken. Lengths may differ between pairs.
+            Demonstrations are such pairs too, and keep what else is known of them.
           terminated: bool [M], which episodes ended by themselves; the others were cut off. False for all if None.
 
         Raises:
@@ -91,7 +92,12 @@ class Demonstrations(Record):
           >>> demonstrations.states.tolist(), demonstrations.final_states.tolist()
           ([[0, 1], [0, 0]], [2, 3])
         """
+        given = trajectories if isinstance(trajectories, cls) else None
+        if given is not None and terminated is None:
+            terminated = given.terminated
         arrays = padded(trajectories, terminated)
+        if given is not None:
+            arrays["is_answer"] = np.asarray(given.is_answer)
         return cls(**{name: checks.to_device(array) for name, array in arrays.items()})
 
     @checks.eager_where_concrete

@@ -368,6 +368,7 @@ def test_initial_policies_that_do_not_fit_are_refused(initial_policy, message):
     [
         ({"method": "simplex"}, r"method must be one of .*, got 'simplex'"),
         ({"tolerance": 0.0}, "tolerance must be positive, got 0.0"),
+        ({"tolerance": [0.1, 0.1]}, r"tolerance must have shape \(\), got \(2,\)"),
         ({"tolerance": np.nan}, "tolerance must be finite, got nan"),
     ],
 )

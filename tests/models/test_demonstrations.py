@@ -456,3 +456,13 @@ def test_terminal_states_that_are_none_are_refused(terminal, message):
     mdp = small_models.case("dense").mdp
     with pytest.raises(ValueError, match=re.escape(message)):
         sample_demonstrations(jax.random.key(0), mdp, np.full((7, 3), 1 / 3), 1, 1, terminal=terminal)
+
+
+def test_demonstrations_of_demonstrations_keep_what_is_known():
+    """Ends, marks of answers; said anew, ends are what is said."""
+    shown = Demonstrations.from_trajectories([([0, 1, 2], [1, 1]), ([0, 3], [0])], [True, False])
+    shown = shown.with_answers([2], [1])
+    again = Demonstrations.from_trajectories(shown)
+    for name in ("states", "actions", "mask", "final_states", "terminated", "is_answer"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(shown, name))
+    assert not Demonstrations.from_trajectories(shown, [False] * 3).terminated.any()

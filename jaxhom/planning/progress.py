@@ -34,15 +34,17 @@ def _report(residual: np.ndarray, tolerance: np.ndarray) -> None:
 
 
 class _Bar:
-    """The bar, which begins where the first report is."""
+    """The bar, which begins where the first report is: there is none without one."""
 
     def __init__(self) -> None:
         self._first: float | None = None
-        self._bar = tqdm(total=100, desc="sweeps", bar_format=_BAR)
+        self._bar: tqdm | None = None
 
     def show(self, residual: float, tolerance: float) -> None:
         if not math.isfinite(residual):
             return
+        if self._bar is None:
+            self._bar = tqdm(total=100, desc="sweeps", bar_format=_BAR)
         self._first = max(residual, self._first or 0.0)
         way = math.log(max(self._first, tolerance) / tolerance) if tolerance > 0 else 0.0
         gone = math.log(self._first / max(residual, tolerance)) if way else 1.0
@@ -51,4 +53,5 @@ class _Bar:
         self._bar.refresh()
 
     def close(self) -> None:
-        self._bar.close()
+        if self._bar is not None:
+            self._bar.close()

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     Policy = Float[ArrayLike, "*B S A"] | Int[ArrayLike, " S"]
 
 _SHOWN = 5  # states that `print` names
+_LEAST_SHOWN = 1e-6  # of the bound: what rounding leaves is no state's fault
 _AGREEMENT = 16.0  # roundings of the model's type within which two rows of a policy are the same
 
 
@@ -255,7 +256,8 @@ def _in_words(loss: LossBound) -> str:
     worst, parts = int(loss.worst), np.asarray(loss.contributions)
     given = "for weights of sum 1" if loss.weights is None else "for the given weights"
     best, own = float(loss.optima[worst]), float(loss.expectations[worst])
-    most = [int(s) for s in np.argsort(-parts, kind="stable")[:_SHOWN] if parts[s] > 0]
+    least = _LEAST_SHOWN * max(float(loss.bound), 0.0)
+    most = [int(s) for s in np.argsort(-parts, kind="stable")[:_SHOWN] if parts[s] > least]
     names = ", ".join(f"{described(s, loss.state_names)} ({parts[s]:.4g})" for s in most) or "none"
     return "\n".join(
         [

@@ -14,6 +14,8 @@ from jaxhom import MDP, LPALMethod, Status, gridworld, lpal
 from jaxhom.apprenticeship import flow_factor, flow_splitting, pdhg
 from jaxhom.apprenticeship.flow_splitting import RELAXATION, STEPS_PER_WEIGHT, Goal, State
 
+iterate, reading = jax.jit(flow_splitting._iterate), jax.jit(flow_splitting.reading)
+
 
 @functools.cache
 def model(name):
@@ -88,10 +90,10 @@ def test_one_iteration(name, lanes, rng):
     x, w = np.maximum(t, 0.0), simplex((np.asarray(goal.expectations) - v) / np.asarray(state.weight))
     u = v + np.asarray(state.weight) * w
     near = projected(*affine_rows(arrays, here.order), np.concatenate([2 * x - t, 2 * u - v]))
-    after = jax.jit(flow_splitting._iterate)(here.splitting, goal, state)
+    after = iterate(here.splitting, goal, state)
     np.testing.assert_allclose(after.t.reshape(-1, lanes), t + RELAXATION * (near[: len(t)] - x), rtol=0, atol=1e-8)
     np.testing.assert_allclose(after.v, v + RELAXATION * (near[len(t) :] - u), rtol=0, atol=1e-8)
-    _, weights, _ = jax.jit(flow_splitting.reading)(here.splitting, goal, state)
+    _, weights, _ = reading(here.splitting, goal, state)
     np.testing.assert_allclose(weights, w, rtol=0, atol=1e-12)
 
 
@@ -101,7 +103,7 @@ def test_the_weight_changes_no_point(rng):
     after = jax.jit(flow_splitting.advance)(here.splitting, goal, state)
     plain = state
     for _ in range(STEPS_PER_WEIGHT):
-        before, plain = plain, flow_splitting._iterate(here.splitting, goal, plain)
+        before, plain = plain, iterate(here.splitting, goal, plain)
     assert np.all(after.weight != state.weight)
     points = [flow_splitting.point(here.splitting, goal, one) for one in (plain, after)]
     chex.assert_trees_all_close(*points, rtol=0, atol=1e-9)
@@ -109,7 +111,7 @@ def test_the_weight_changes_no_point(rng):
     np.testing.assert_allclose(after.change, change, rtol=1e-9)
     x = np.maximum(before.t, 0.0) + (plain.t - before.t) / RELAXATION
     np.testing.assert_allclose(after.x, x, rtol=0, atol=1e-9)
-    read, _, value = flow_splitting.reading(here.splitting, goal, after)
+    read, _, value = reading(here.splitting, goal, after)
     np.testing.assert_allclose(read, np.maximum(x, 0.0), rtol=0, atol=1e-9)
     np.testing.assert_allclose(value, plain.value, rtol=0, atol=1e-9)
     first = flow_splitting.point(here.splitting, goal, state)

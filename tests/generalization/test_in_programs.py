@@ -311,8 +311,8 @@ def global_draws(name):
     return draws(name, 2, 3)
 
 
-@pytest.mark.parametrize("anchored", [True, False])
-@pytest.mark.parametrize("name", ["ends", "restricted", "narrow"])
+# HiGHS solves what is neither anchored nor restricted.
+@pytest.mark.parametrize(("name", "anchored"), [("ends", False), ("restricted", True), ("narrow", False)])
 def test_the_global_map_draw_by_draw(name, anchored):
     """Bounds overlap, and hold HiGHS's optimum; without a demonstration they are infinite and nothing is found."""
     mdp, shown, tolerance = model(name), global_draws(name), 3e-2

@@ -90,8 +90,9 @@ def test_no_change_is_larger_for_any_weights():
         assert np.abs(weights @ changed("sparse", queries.states[0], action)).max() <= queries.changes[0] + 1e-12
 
 
-@pytest.mark.parametrize("name", ["sparse", "absorbing", "restricted"])
-@pytest.mark.parametrize("criterion", ["visits", "visits_entropy"])
+@pytest.mark.parametrize(
+    ("name", "criterion"), [("sparse", "visits_entropy"), ("absorbing", "visits"), ("restricted", "visits_entropy")]
+)
 def test_programs_find_what_the_host_finds(name, criterion):
     case, shown, policy = problem(name)
     ask = functools.partial(query_states, count=5, criterion=criterion)

@@ -38,10 +38,17 @@ def close(found, expected):
 def test_one_step_maps(dynamics, batch, rng):
     value, x = rng.normal(size=(S, *batch)), rng.normal(size=(S, A, *batch))
     backward = np.tensordot(TRANSITION, value, axes=1)
-    close(dynamics.expected_next_value(value), backward)
-    close(jnp.stack(jax.jit(lambda d, v: d.expected_next_values(v))(dynamics, value), axis=1), backward)
-    close(dynamics.push_forward(x), np.tensordot(TRANSITION, x, axes=((0, 1), (0, 1))))
-    close(dynamics.transition, TRANSITION)
+
+    @jax.jit
+    def maps(dynamics, value, x):
+        each = jnp.stack(dynamics.expected_next_values(value), axis=1)
+        return dynamics.expected_next_value(value), each, dynamics.push_forward(x), dynamics.transition
+
+    at_once, each, forward, transition = maps(dynamics, value, x)
+    close(at_once, backward)
+    close(each, backward)
+    close(forward, np.tensordot(TRANSITION, x, axes=((0, 1), (0, 1))))
+    close(transition, TRANSITION)
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (4,)])
@@ -49,13 +56,17 @@ def test_chains_of_policies(dynamics, batch, rng):
     policy = np.moveaxis([small_models.random_policy(rng, S, A) for _ in range(batch[0] if batch else 1)], 0, -1)
     value = rng.normal(size=(S, *batch))
     matrices = np.einsum("sab,saz->bsz", policy, TRANSITION)
-    chain = dynamics.chain(jnp.asarray(policy if batch else policy[..., 0]))
     columns = value if batch else value[:, None]
     backward = np.stack([matrix @ column for matrix, column in zip(matrices, columns.T, strict=True)], axis=-1)
     forward = np.stack([column @ matrix for matrix, column in zip(matrices, columns.T, strict=True)], axis=-1)
-    close(chain.expected_next_value(jnp.asarray(value)), backward.reshape(value.shape))
-    close(chain.push_forward(jnp.asarray(value)), forward.reshape(value.shape))
-    close(dynamics.state_transition(policy[..., 0]), matrices[0])
+
+    @jax.jit
+    def maps(dynamics, policy, first, value):
+        chain = dynamics.chain(policy)
+        return chain.expected_next_value(value), chain.push_forward(value), dynamics.state_transition(first)
+
+    found = maps(dynamics, policy if batch else policy[..., 0], policy[..., 0], value)
+    jax.tree.map(close, found, (backward.reshape(value.shape), forward.reshape(value.shape), matrices[0]))
 
 
 def test_what_the_host_asks(dynamics, rng):

@@ -171,7 +171,7 @@ def test_greedy_policy(slack, expected):
     np.testing.assert_array_equal(greedy_policy(batch, slack)[1], np.eye(3)[expected])
 
 
-@pytest.mark.parametrize("name", ["one_state", "restart"])
+@pytest.mark.parametrize("name", ["one_state", "sparse"])
 @pytest.mark.parametrize("discount", [0.9, 0.999])
 def test_float32_stops_by_itself_and_its_bound_holds(name, discount):
     """Against the optimum of the rounded model, in float64."""
@@ -241,7 +241,7 @@ def test_a_former_value_saves_the_sweeps():
 
 
 def test_vmapped_discounts_and_jit():
-    case, reward = small_models.case("restart"), reward_of("restart")
+    case, reward = small_models.case("sparse"), reward_of("sparse")
     discounts = np.array([0.5, 0.9])
 
     @jax.jit
@@ -342,8 +342,9 @@ def test_what_the_model_does_not_allow_is_never_planned_for(transform, rng):
     np.testing.assert_allclose(plan.value, value, rtol=0, atol=1e-7)
     np.testing.assert_allclose(np.asarray(plan.action_value)[allowed], action_value[allowed], rtol=0, atol=1e-7)
     assert (np.asarray(plan.action_value)[~allowed] == -np.inf).all() and not np.asarray(plan.policy)[~allowed].any()
-    gradient = jax.grad(lambda reward: optimal_policy(mdp, reward).value.sum())(reward)
-    assert np.isfinite(gradient).all() and not gradient[~allowed].any()
+    if transform is jax.jit:
+        gradient = jax.jit(jax.grad(lambda reward: optimal_policy(mdp, reward).value.sum()))(reward)
+        assert np.isfinite(gradient).all() and not gradient[~allowed].any()
 
 
 def test_many_actions_compile_in_seconds(rng):

@@ -1,5 +1,7 @@
 """Derivatives of optimal values against differences of exact policy iteration."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,7 +71,8 @@ def test_forward_mode_and_a_batch_of_rewards(rng):
     """Each lane along a direction of its own; the policy is a constant."""
     case = small_models.case("dense")
     rewards, directions = rng.normal(size=(2, 3, *case.shape))
-    change = jax.jvp(lambda rewards: optimal_policy(case.mdp, rewards), (rewards,), (directions,))[1]
+    plan = functools.partial(optimal_policy, case.mdp)
+    change = jax.jit(lambda *pair: jax.jvp(plan, pair[:1], pair[1:])[1])(rewards, directions)
     parameters, _ = parameters_of(case, rng)
     for lane in range(3):
         here = {**parameters, "reward": rewards[lane]}
@@ -89,7 +92,7 @@ def test_vmap_and_second_derivatives(rng):
         return values(case.mdp, {**parameters, "discount": discount}).sum()
 
     first = jax.jit(jax.vmap(jax.grad(total)))(discounts)
-    second = jax.grad(jax.grad(total))(discounts[1])
+    second = jax.jit(jax.grad(jax.grad(total)))(discounts[1])
     step = 1e-4
     at = [
         [oracle(case, {**parameters, "discount": discount + move}).sum() for move in (-step, 0.0, step)]

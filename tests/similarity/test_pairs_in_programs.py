@@ -60,8 +60,10 @@ def assert_brackets(found, error, tolerance=1e-4):
     assert np.all(found.upper - found.lower <= tolerance)
 
 
-@pytest.mark.parametrize("make", [sparse_model, restricted_model], ids=["all actions", "some actions"])
-@pytest.mark.parametrize(("distance", "anchored"), [(1, True), (2, True), (1, False)])
+@pytest.mark.parametrize(
+    ("make", "distance", "anchored"),
+    [(sparse_model, 1, True), (sparse_model, 2, True), (restricted_model, 1, False), (restricted_model, 2, True)],
+)
 def test_bounds_under_jit(make, distance, anchored):
     mdp, options = make(), {"distance": distance, "anchored": anchored}
     found = jax.jit(with_probability(mdp, **options))(mdp.probability)
@@ -144,8 +146,7 @@ def test_grad_without_jit_and_second_derivatives():
         jax.hessian(error)(mdp.probability)
 
 
-@pytest.mark.parametrize("mutual", [False, True])
-@pytest.mark.parametrize("threshold", [0.0, 0.2])
+@pytest.mark.parametrize(("threshold", "mutual"), [(0.0, False), (0.2, True)])
 def test_decisions(threshold, mutual):
     mdp = sparse_model()
     similar = jax.jit(lambda s, t: locally_similar(mdp, s, t, threshold, mutual=mutual, tolerance=1e-3))(*PAIRS)

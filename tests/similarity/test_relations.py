@@ -142,13 +142,33 @@ def test_random_walk_is_the_normalised_kernel_of_long_walks(kind):
     assert np.all(found.upper[alike] < 1e-12) and np.all(found.lower <= 1.0)
 
 
-@KINDS
-@pytest.mark.parametrize(("labelled", "anchored"), [(False, True), (True, True), (False, False)])
+@pytest.mark.parametrize(
+    ("kind", "labelled", "anchored"),
+    [
+        ("sparse", False, True),
+        ("sparse", True, True),
+        ("deterministic", False, False),
+        ("deterministic", True, True),
+        ("restricted", False, True),
+        ("restricted", False, False),
+        ("ring", False, True),
+        ("ring", True, True),
+    ],
+)
 def test_lax_is_the_least_error_over_permutations(kind, labelled, anchored):
-    mdp = model(kind)
+    mdp, solved = model(kind), {}
     labels = labels_for(mdp) if labelled else None
     table = SimilarityTable(mdp, relation="lax", labels=labels, anchored=anchored)
-    least = by_brute_force(mdp, lambda *ends: oracles.lax_homomorphism_lp(*ends[:2], anchored, ends[2])[0], labels)
+
+    def solve(source, target, both):
+        """The oracle's error and its orders; pairs of models that occur twice are solved once."""
+        arrays = [source, target, *(both or ())]
+        key = tuple((array.shape, array.tobytes()) for array in map(np.ascontiguousarray, arrays))
+        if key not in solved:
+            solved[key] = oracles.lax_homomorphism_lp(source, target, anchored, both)
+        return solved[key]
+
+    least = by_brute_force(mdp, lambda *ends: solve(*ends)[0], labels)
     for threshold in (0.0, 0.3):
         asked = np.abs(least - threshold) > 2e-4
         similar = table.decide(*PAIRS, threshold)
@@ -160,8 +180,7 @@ def test_lax_is_the_least_error_over_permutations(kind, labelled, anchored):
         (source, own), (target, other) = (local(mdp, state, labels) for state in (s, t))
         kept = None if own is None else (own, other[:, renaming])
         assert oracles.homomorphism_lp(source, target[:, renaming], anchored, kept)[0] <= error + 2e-4
-        ends = (source, target, anchored, None if own is None else (own, other))
-        best = oracles.lax_homomorphism_lp(*ends)[1]
+        best = solve(source, target, None if own is None else (own, other))[1]
         moved = [sum(a != b for a, b in enumerate(order)) for order in (renaming, *best)]
         assert moved[0] <= min(moved[1:])  # the fewest actions are renamed
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from bench import comparison, relations, summaries
+from bench import comparison, relations, speed_quotations, summaries
 from bench.guarantees import TRUE
 from bench.provenance import RESULTS, ROOT
 from bench.rows import read_rows
@@ -40,7 +40,8 @@ class Quotation:
 def quotations(folder: pathlib.Path = RESULTS) -> list[Quotation]:
     """All passages, with the numbers of the rows in a folder."""
     made = [*_table1(folder), *_figure1(folder), *_relations(folder), *_learners(folder), *_guarantees(folder)]
-    return [Quotation(page, passage) for page, passage in [*made, *_queries(folder)]]
+    made += [*_queries(folder), *speed_quotations.passages(folder)]
+    return [Quotation(page, passage) for page, passage in made]
 
 
 def stale(folder: pathlib.Path = RESULTS) -> list[str]:
@@ -54,6 +55,14 @@ def _in_one_line(text: str) -> str:
 
 def _rows(folder: pathlib.Path, name: str) -> list:
     return read_rows(folder / "raw" / f"{name}.csv")
+
+
+def _by_setting(rows: list) -> list[list]:
+    """The rows of each domain and number of demonstrations."""
+    found: dict = {}
+    for row in rows:
+        found.setdefault((row.domain, row.demonstrations), []).append(row)
+    return list(found.values())
 
 
 class _Summary:
@@ -101,6 +110,14 @@ def _table1(folder: pathlib.Path) -> Iterator[tuple[str, str]]:
         f"({low['ratio']:.0f} to {high['ratio']:.0f}% of the expert's reward; "
         f"{low['paper_ratio']:.0f} to {high['paper_ratio']:.0f}% as printed)",
     )
+    zeros, uniform = (
+        100.0 * cells[cells["method"] == method]["ratio"].agg(["min", "max"]) for method in ("lpal_zeros", "uniform")
+    )
+    yield (
+        "README.md",
+        f"Fed with zeros, LPAL earns {zeros['min']:.0f} to {zeros['max']:.0f}% of it, and a uniform policy "
+        f"{uniform['min']:.0f} to {uniform['max']:.0f}%",
+    )
 
 
 def _figure1(folder: pathlib.Path) -> Iterator[tuple[str, str]]:
@@ -132,11 +149,16 @@ def _relations(folder: pathlib.Path) -> Iterator[tuple[str, str]]:
     )
     candidates = relations.CANDIDATES["relations"]
     gaps = comparison.choice_gaps(_rows(folder, "relations"), "chosen, highest score", candidates)
-    behind, average = sum(gap.is_behind for gap in gaps), np.mean([gap.ahead.mean for gap in gaps])
+    behind, ahead = sum(gap.is_behind for gap in gaps), np.array([gap.ahead.mean for gap in gaps])
     yield (
         "README.md",
-        f"is {-average:.1f} points behind the best candidate on average, and in {behind} of {len(gaps)} settings by "
-        "more than one interval",
+        f"is {-ahead.mean():.1f} points behind the best candidate on average, and in {behind} of {len(gaps)} settings "
+        "by more than one interval",
+    )
+    yield (
+        "docs/relations.md",
+        f"on {len(gaps)} settings of tracks, grids and lakes the choice lies {-ahead.mean():.1f} points below the best "
+        f"candidate on average, between {-ahead.max():.1f} and {-ahead.min():.0f}.",
     )
     uniform = roads.percent("road", 2, "uniform elsewhere")
     yield "README.md", f"better than a uniform policy ({uniform}% of the expert's time at the destination)"
@@ -155,6 +177,10 @@ def _relations(folder: pathlib.Path) -> Iterator[tuple[str, str]]:
 
 def _learners(folder: pathlib.Path) -> Iterator[tuple[str, str]]:
     summary = _Summary(folder, "learners")
+
+    draws = {len({row.draw for row in rows}) for rows in _by_setting(_rows(folder, "learners"))}
+    for page in ("README.md", "docs/which_method.md"):
+        yield page, f"means of {' to '.join(map(str, sorted(draws)))} draws"
 
     def line(name: str, method: str) -> str:
         columns = [summary.column(domain, counts, method) for domain, counts in (*_LEARNERS, *_LEARNERS_TRACKS)]

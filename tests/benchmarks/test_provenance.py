@@ -7,7 +7,8 @@ import pytest
 
 from bench import provenance, reproduce, scale, speed, sweep_costs
 
-COMMITTED = sorted([*provenance.RESULTS.glob("raw/*.csv"), *provenance.RESULTS.glob("*.jsonl")])
+KINDS = ("raw/*.csv", "*.jsonl", "speed_*.csv", "sweep_costs.csv")
+COMMITTED = sorted(path for kind in KINDS for path in provenance.RESULTS.glob(kind))
 
 
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)

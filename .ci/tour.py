@@ -24,7 +24,7 @@ demonstrations = jaxhom.sample_demonstrations(jax.random.key(0), lake, plan, 2, 
 general = jaxhom.soft_local_homomorphism(lake, demonstrations)
 assert jax.tree.map(np.shape, general).policy == (16, 4)
 expectations = jaxhom.feature_expectations(lake, general)
-for method in ("columns", "interior_point", "flow"):
+for method in ("columns", "interior_point", "pdhg"):
     solution = jaxhom.lpal(lake, expectations, initial_policy=general, method=method, tolerance=1e-2)
     assert solution.margin <= solution.margin_bound
 

@@ -208,6 +208,6 @@ def _planning(rows: _Rows) -> Iterator[str]:
         pair(section, "occupancy", "scipy") for section in ("grid48", "racetrack_a", "garnet_sparse")
     )
     yield (
-        f"Occupancies of one policy take {grid[0]} s on that grid, {track[0]} s on racetrack (a) and {garnet[0]} s on a "
-        f"sparse random model of 10,000 states (SciPy {grid[1]}, {track[1]} and {garnet[1]})."
+        f"Occupancies of one policy take {grid[0]} s on that grid, {track[0]} s on racetrack (a) and {garnet[0]} s on "
+        f"a sparse random model of 10,000 states (SciPy {grid[1]}, {track[1]} and {garnet[1]})."
     )

@@ -63,22 +63,21 @@ def checked_start(
     if warm_start is not None:
         if not isinstance(warm_start, LPALSolution):
             raise ValueError(f"warm_start must be an LPALSolution, got {type(warm_start).__name__}")
-        initial_policy = warm_start.policy if initial_policy is None else initial_policy
-        weights = _for_each_lane("warm_start.weights", warm_start.weights, batch)
-    if initial_policy is not None:
-        policy = check_policy(mdp, initial_policy, "initial_policy")
-        initial_policy = _for_each_lane("initial_policy", policy, batch)
-    return initial_policy, weights
+        weights = _for_each_lane("warm_start.weights", warm_start.weights, batch, rank=1)
+    is_given = initial_policy is not None
+    name = "initial_policy" if is_given or warm_start is None else "warm_start.policy"
+    guess = initial_policy if is_given or warm_start is None else warm_start.policy
+    policies = None if guess is None else _for_each_lane(name, check_policy(mdp, guess, name), batch, rank=2)
+    return policies, weights
 
 
-def _for_each_lane(name: str, guess: Any, batch: tuple[int, int]) -> Host:
-    """Distributions [..., n], one for all lanes of the batch or one for each, as [B, ..., n]."""
+def _for_each_lane(name: str, guess: Any, batch: tuple[int, int], rank: int) -> Host:
+    """Weights [K] (rank 1) or policies [S, A] (rank 2), one for all lanes of the batch or one for each, as [B, ...]."""
     is_traced = checks.is_traced(guess)
     guess = guess if is_traced else checks.as_host_array(name, guess)
-    lane_ndim = 1 if name.endswith("weights") else 2
-    lane_shape = batch[1:] if lane_ndim == 1 else guess.shape[-2:]
-    good = guess.shape[-lane_ndim:] == lane_shape and guess.shape[:-lane_ndim] in ((), batch[:1])
-    checks.require_shape(name, guess, f"({batch[0]}, {'K' if lane_ndim == 1 else 'S, A'})", good)
+    lane_shape = batch[1:] if rank == 1 else guess.shape[-2:]
+    good = guess.shape[-rank:] == lane_shape and guess.shape[:-rank] in ((), batch[:1])
+    checks.require_shape(name, guess, f"({batch[0]}, {'K' if rank == 1 else 'S, A'})", good)
     if is_traced:
         return jnp.broadcast_to(guess, (batch[0], *lane_shape))
     return np.broadcast_to(checks.require_distribution(name, guess), (batch[0], *lane_shape))

@@ -16,10 +16,11 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features, check_tolerance, checked_expectations
 from jaxhom.apprenticeship.certificate import ExactSides
-from jaxhom.apprenticeship.exact import exact_rows, rounded_down
+from jaxhom.apprenticeship.exact import exact_rows, rounded_down, rounded_up
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.presolve import Reach
+from jaxhom.apprenticeship.solution import RARE_STATES
 from jaxhom.models.inputs import as_model, require_features
 from jaxhom.models.mdp import MDP
 from jaxhom.planning import policy_iteration
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float, Int
 
 _DIGITS = 1e-3  # share of the tolerance by which responses may miss the best, and evaluations the truth
-_NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact, and many rare states add up
 
 
 class Responder:
@@ -128,14 +128,14 @@ class Outcome:
         self.advantage, actions = sides.advantage(self.weights.astype(np.float64), expectations, proposal.value, error)
         best = np.eye(x.shape[1])[actions]
         self.greedy_policy = best.astype(dtype)
-        self.policy = exact_rows(policy_from_occupancy(sides.mdp, x, best, _NO_OCCUPANCY), dtype)
+        self.policy = exact_rows(policy_from_occupancy(sides.mdp, x, best, RARE_STATES), dtype)
         self.low, self.high = sides.expected(self.policy, error)
 
     def learned(self, objective: float, bound: float, *, is_above: bool) -> Learned:
         """The record of the lane. `is_above`: whether the objective is to come down to the bound, or up."""
         dtype, stopped = self.policy.dtype, self._proposal.status
         high, low = (objective, bound) if is_above else (bound, objective)
-        high, low = -rounded_down(-high, dtype), rounded_down(low, dtype)
+        high, low = rounded_up(high, dtype), rounded_down(low, dtype)
         is_closed = float(high) - float(low) <= self._tolerance
         if stopped == Status.SOLVED:
             stopped = Status.STALLED  # unless what is returned agrees

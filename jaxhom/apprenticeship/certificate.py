@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.apprenticeship.exact import ENOUGH, NEAR_ONE, Exact, exact_rows, rounded_down
+from jaxhom.apprenticeship.exact import ENOUGH, NEAR_ONE, Exact, exact_rows, rounded_down, rounded_up
 from jaxhom.apprenticeship.presolve import Reduction
 from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.mdp import MDP
@@ -244,7 +244,7 @@ class Certifier:
 
 def _rounded(margin: np.ndarray, bound: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
     """Both sides [C], outwards. Bounds that rounding has made to cross are both uncertain."""
-    return rounded_down(np.minimum(margin, bound), dtype), -rounded_down(-np.maximum(margin, bound), dtype)
+    return rounded_down(np.minimum(margin, bound), dtype), rounded_up(np.maximum(margin, bound), dtype)
 
 
 def _is_closed(margin: np.ndarray, bound: np.ndarray, tolerance: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -19,7 +19,7 @@ from jaxhom.apprenticeship.exact import NEAR_ONE, Exact
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.responses import evaluate, evaluate_on_host, respond, respond_on_host, with_compact_features
-from jaxhom.apprenticeship.solution import Found, LPALMethod
+from jaxhom.apprenticeship.solution import RARE_STATES, Found, LPALMethod
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning.occupancy import policy_from_occupancy
 from jaxhom.solvers.game_interior_point import GameSolution
@@ -32,7 +32,6 @@ _PULLS = (0.3, 0.7)  # shares of the best bound's weights in a query; the second
 _FEW_FEATURES, _FEW_PULLS = 8, (0.0, 0.5)  # up to here the weights do not jump
 _LOOSE_GAME = 0.5  # share of the open gap that the game may leave
 _LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to the bound: more digits prove nothing more
-_NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact, and many rare states add up
 _FROM_POOL = 8  # policies of other lanes that join a game at a time: 16 lanes of bumps24 (bench/results/speed_lpal.csv)
 # take 342 iterations, 381 if none may join
 _prepared: set[str] = set()  # kinds of models whose programs are there, or under way
@@ -235,7 +234,7 @@ class Rounds:
             gap=np.array([lane.gap for lane in lanes]),
             decided_by=np.array([LPALMethod.COLUMNS if lane.has_asked else offered_by for lane in lanes]),
             stopped=np.where(counts >= self._limit, Status.ITERATION_LIMIT, Status.STALLED),
-            negligible=_NO_OCCUPANCY,
+            negligible=RARE_STATES,
         )
 
 

@@ -7,7 +7,7 @@ A lane that ends says how: the largest entry of the gradient that signs do not f
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,6 @@ from jaxhom.apprenticeship.causal_entropy import Evidence, HostObjective, object
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.host_chains import host_model
 from jaxhom.status import Status
-
-if TYPE_CHECKING:
-    pass
 
 _STEP = 0.1  # of Adam, which is what programs use where no optimiser is given; in units of scaled weights
 
@@ -40,10 +37,12 @@ class Problem(NamedTuple):
 
     @property
     def is_split(self) -> bool:
+        """Whether variables are two parts of the weights."""
         return self.l1 > 0 and not self.nonnegative
 
     @property
     def is_bounded(self) -> bool:
+        """Whether variables must be non-negative."""
         return self.nonnegative or self.is_split
 
     def variables(self, xp, weights):
@@ -120,16 +119,20 @@ def fit_on_host(mdp: MDP, features, evidence: Evidence, start, problem: Problem,
 
 
 def fit_in_program(mdp: MDP, features, evidence: Evidence, start, problem: Problem, optimizer) -> Fit:
-    """All lanes by an optimiser of optax, in one loop."""
-    import optax
-
-    optimizer = optax.adam(_STEP) if optimizer is None else optimizer
+    """All lanes by an optimiser of optax, in one loop, which is compiled once per optimiser."""
+    optimizer = _adam() if optimizer is None else optimizer
     if not (callable(getattr(optimizer, "init", None)) and callable(getattr(optimizer, "update", None))):
         raise ValueError(f"optimizer must be an optax.GradientTransformation, got {checks.in_one_line(optimizer)}")
-    optimizer = optax.with_extra_args_support(optimizer)
     arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, mdp.dtype), (features, start))
     evidence = jax.tree.map(lambda leaf: jnp.asarray(leaf, mdp.dtype), evidence)
     return _descend(mdp, *arrays, evidence, problem=problem, optimizer=optimizer)
+
+
+@functools.cache
+def _adam():
+    import optax
+
+    return optax.adam(_STEP)
 
 
 @functools.partial(jax.jit, static_argnames=("problem", "optimizer"))
@@ -153,6 +156,8 @@ class _Descent(NamedTuple):
 def _descend_one(mdp: MDP, features, start, problem: Problem, optimizer, evidence: Evidence) -> Fit:
     """One lane: steps of the optimiser, each projected on the signs; the best variables of the way are returned."""
     import optax
+
+    optimizer = optax.with_extra_args_support(optimizer)
 
     def penalised(variables, value):
         objective, value = objective_in_program(mdp, features, evidence, problem.weights(variables), value)

@@ -305,3 +305,8 @@ def rounded_down(numbers: Float[ArrayLike, "..."], dtype: np.dtype | type) -> Fl
     # In float64: Python numbers would be compared in the shorter type, where the two are equal.
     is_above = rounded.astype(np.float64) > numbers
     return np.where(is_above, np.nextafter(rounded, np.array(-np.inf, dtype)), rounded)
+
+
+def rounded_up(numbers: Float[ArrayLike, "..."], dtype: np.dtype | type) -> Float[np.ndarray, "..."]:
+    """The smallest numbers of the type that are not below the given ones."""
+    return -rounded_down(-np.asarray(numbers, np.float64), dtype)

@@ -24,7 +24,7 @@ from jaxhom.apprenticeship.planning_bound import UpperBound, bound_by_planning
 from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectations
 from jaxhom.apprenticeship.program import Program
 from jaxhom.apprenticeship.responses import expected_features
-from jaxhom.apprenticeship.solution import LPALMethod, LPALSolution
+from jaxhom.apprenticeship.solution import RARE_STATES, LPALMethod, LPALSolution
 from jaxhom.models.mdp import MDP, push_forward, uniform_policy
 from jaxhom.planning.occupancy import policy_from_occupancy
 from jaxhom.planning.plan import Plan
@@ -44,7 +44,6 @@ _LOOSE_GAME = 0.5  # share of the open gap that a game may leave
 _LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to a bound
 _ERROR = 0.02  # share of the tolerance by which expectations of a column may be off
 _CLOSED = 0.9  # share of the tolerance at which a lane is: the rest is for what the last certificate adds
-_NO_OCCUPANCY = 1e-14  # share of all time that counts as none: mixtures are exact
 
 
 class Asked(Record):
@@ -275,7 +274,7 @@ def _certified(program: Program, asked: Asked, reduction, tolerance, now: _Stand
     mdp, unit, eps = program.mdp, program.unit, jnp.finfo(program.mdp.dtype).eps
     x = jnp.einsum("bc,bcsa->bsa", now.q, now.x)
     best = jax.nn.one_hot(now.actions, mdp.num_actions, dtype=mdp.dtype)
-    policy = policy_from_occupancy(mdp, x, best, negligible=_NO_OCCUPANCY)
+    policy = policy_from_occupancy(mdp, x, best, negligible=RARE_STATES)
     occupancy = x.sum(axis=-1, keepdims=True) * policy
     expected, error = _expected_features(mdp, occupancy)
     given, shift = asked.expectations / unit, reduction.shift / unit

@@ -27,7 +27,7 @@ from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features
 from jaxhom.apprenticeship.best_responses import Responder, require_features
 from jaxhom.apprenticeship.certificate import ExactSides
-from jaxhom.apprenticeship.exact import compact_features, rounded_down
+from jaxhom.apprenticeship.exact import compact_features, rounded_down, rounded_up
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.models.demonstrations import Demonstrations, monte_carlo_feature_expectations
 from jaxhom.models.inputs import as_model, check_policy
@@ -229,7 +229,7 @@ def _learned(
         weights=given,
         expectations=expectations,
         objective=rounded_down(value, dtype),
-        bound=-rounded_down(-max(bound, value), dtype),
+        bound=rounded_up(max(bound, value), dtype),
         iterations=np.int32(iterations),
         status=np.int32(status),
     )

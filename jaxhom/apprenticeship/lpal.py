@@ -26,7 +26,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.arguments import check_features, check_tolerance, checked_expectations, checked_start
+from jaxhom.apprenticeship.arguments import (
+    check_features,
+    check_tolerance,
+    checked_expectations,
+    checked_start,
+)
 from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.columns import solve_by_columns
 from jaxhom.apprenticeship.in_program import ITERATIONS, solve_in_program

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 
 from jaxhom.models.mdp import MDP
@@ -67,13 +66,3 @@ def bound_by_planning(
     size += terms * (jnp.abs(target).sum(axis=-1) + jnp.abs(bound))
     bound += jnp.finfo(mdp.dtype).eps * size
     return UpperBound(margin_bound=bound, weights=weights, policy=plan.policy), plan
-
-
-def better_bound(one: UpperBound, other: UpperBound) -> UpperBound:
-    """Lane by lane the smaller of two bounds."""
-    take = other.margin_bound < one.margin_bound
-
-    def choose(old, new):
-        return jnp.where(take.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
-
-    return jax.tree.map(choose, one, other)

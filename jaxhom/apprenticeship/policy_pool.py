@@ -1,4 +1,4 @@
-"""The pool of LPAL on columns: the policies that any lane has met, and the bounds, for all lanes to use.
+"""The pool of whoever adds columns: the policies that any lane has met, and the bounds, for all lanes to use.
 
 A *cut* is what planning for weights w has proved: no policy's w . V is above h. The upper bound of any lane is then
 h - w . Vhat at the most.
@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from jaxhom.models.mdp import MDP
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, Float, Int
+    from jaxtyping import Float, Int
 
 _FIRST_SIZE = 64  # policies that there is room for; the room doubles when it is full
 
@@ -28,7 +27,7 @@ class PolicyPool:
     """
 
     def __init__(self, mdp: MDP):
-        self._num_actions, self._dtype = mdp.num_actions, np.dtype(mdp.dtype)
+        self._num_actions = mdp.num_actions
         self._action_dtype = np.min_scalar_type(mdp.num_actions - 1)
         self._expected = np.zeros((_FIRST_SIZE, mdp.num_features))
         self._policies: list[tuple[np.ndarray, np.ndarray]] = []
@@ -88,10 +87,6 @@ class PolicyPool:
             else:
                 x += probability * mu[:, None] * policy
         return x
-
-    def one_hot(self, actions: Int[np.ndarray, "*B S"]) -> Float[Array, "*B S A"]:
-        """Actions [..., S] as a policy [..., S, A]."""
-        return jax.nn.one_hot(actions, self._num_actions, dtype=self._dtype)
 
 
 def _with_room(table: Float[np.ndarray, "N M"], number: int) -> Float[np.ndarray, "R M"]:

@@ -175,7 +175,7 @@ def _values(mdp: MDP) -> tuple[Float[Host, "N K"], Bool[Host, "N 1"]]:
 
 
 def _times(mdp: MDP) -> Float[Host, "2 1"]:
-    """Discounted times [N, 1], over what rounding leaves open."""
+    """The least and the largest discounted time [2, 1], over what rounding leaves open."""
     numpy = jnp if checks.is_traced(mdp) else np
     if numpy is jnp:
         total, initial, discount = mdp.probability.sum(axis=-1), mdp.initial.sum(), mdp.discount

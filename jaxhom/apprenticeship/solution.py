@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from jaxtyping import Array, Float, Int
 
 
+RARE_STATES = 1e-14
+"""Share of all time that counts as none in mixtures of policies: they are exact, and many rare states add up."""
+
+
 class LPALMethod(enum.IntEnum):
     """The method whose policy and weights a solution of LPAL has; `method` says which was asked for.
 

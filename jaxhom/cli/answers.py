@@ -75,7 +75,7 @@ class Answers:
 
     def _keep(self, state: int, action: int) -> None:
         if self._path is not None:
-            append_answer(self._path, state, action)
+            append_answer(self._path, state, action, mdp=self._problem.mdp)
             self._output.note(self._path)
         self._states.append(state)
         self._actions.append(action)

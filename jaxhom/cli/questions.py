@@ -38,7 +38,7 @@ def mark(number: int) -> str:
 
 
 def name_of(problem: Problem, state: int) -> str:
-    """A state's number, and its name or on maps its place, as `Problem.state_of` takes either."""
+    """A state's number, and its name or on maps its place; the latter is what `Problem.state_of` looks for first."""
     if problem.mdp.state_names is not None:
         return f"{state} {plain_text(problem.mdp.state_names[state])}"
     if problem.domain is None or problem.coordinates is None:

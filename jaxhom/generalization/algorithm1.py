@@ -76,9 +76,9 @@ def soft_local_homomorphism(
       tolerance: an error up to threshold + tolerance may count as similar; see `locally_similar`.
       states: bool [S], the states to find a policy for; the others stay uniform. All if None. Leaving out states in
         which the action does not matter, and which lead to many, saves their large local models.
-      table: a `SimilarityTable` of the same model, `distance` and `anchored`, for many sets of demonstrations or
-        thresholds: pairs of classes that it has met are not solved again. Made anew if None. Under a trace it is
-        needed, and completed for the threshold: `SimilarityTable(mdp, ...).complete(threshold)`.
+      table: a `SimilarityTable` of the same model, `distance`, `anchored`, `relation` and `labels`, for many sets of
+        demonstrations or thresholds: pairs of classes that it has met are not solved again. Made anew if None. Under a
+        trace it is needed, and completed for the threshold: `SimilarityTable(mdp, ...).complete(threshold)`.
       progress: show a progress bar.
       similarity: the former name of `table`, which warns.
 
@@ -116,8 +116,8 @@ def soft_local_homomorphism(
         if table is not None:
             raise ValueError("similarity is the former name of table: give one of them")
         table = similarity
-    checks.refuse_traced(distance=distance, anchored=anchored, labels=labels, label_weight=label_weight)
-    checks.refuse_traced(mutual=mutual)
+    fixed = {"distance": distance, "anchored": anchored, "mutual": mutual}
+    checks.refuse_traced(**fixed, labels=labels, label_weight=label_weight)
     rule = VotingRule(threshold, bool(mutual), tolerance, voters, weights, temperature)
     mdp = as_model(mdp)
     is_traced = checks.is_traced(mdp, demonstrations, states)

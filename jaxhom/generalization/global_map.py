@@ -41,9 +41,9 @@ class GlobalMap(NamedTuple):
 def require_effort(tolerance, max_iterations, progress) -> Effort:
     """The options as a user gives them, or `ValueError`."""
     checks.refuse_traced(tolerance=tolerance, max_iterations=max_iterations)
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be positive, got {tolerance}")
-    return Effort(tolerance, max_iterations, progress)
+    tolerance = checks.require_number("tolerance", tolerance)
+    checks.require_positive("tolerance", tolerance)
+    return Effort(tolerance, checks.require_count("max_iterations", max_iterations), progress)
 
 
 def map_on_host(problem: HostProblem, effort: Effort) -> GlobalMap:

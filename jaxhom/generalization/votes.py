@@ -103,7 +103,7 @@ def elected(found: Votes, total, voters, radius) -> Votes:
 def vote_of_nearest(visited, policy, coordinates: np.ndarray, accept=None) -> Votes:
     """The demonstrated states at the least Euclidean distance in `coordinates` [S, D], ties included.
 
-    `accept` decides pairs as in `vote_of_rings`; all are accepted if None.
+    `accept(asking, experts)` says which pairs count, bool; all do if None.
     """
     found = no_votes(visited, policy)
     experts, waiting = np.flatnonzero(visited), np.flatnonzero(~visited)

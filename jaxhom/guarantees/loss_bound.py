@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features
-from jaxhom.apprenticeship.exact import rounded_down
+from jaxhom.apprenticeship.exact import rounded_down, rounded_up
 from jaxhom.guarantees import all_time, first_steps
 from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
@@ -184,7 +184,7 @@ class Agreeing:
         self.agreed = np.asarray(deciding_states(mdp, visited))
         self._choices = Choices(mdp, self.agreed, self._expert)
         self._best = self._plan(self._choices, progress)
-        self.optima = _rounded_up(self._best.upper, mdp.dtype)
+        self.optima = rounded_up(self._best.upper, mdp.dtype)
         self.status = self._best.status
 
     def loss(self, policy: Float[np.ndarray, "S A"], weights: Float[np.ndarray, " K"] | None) -> LossBound:
@@ -194,7 +194,7 @@ class Agreeing:
         dtype = self._mdp.dtype
         expectations = rounded_down(own.lower, dtype)
         # From the rounded numbers, so that whoever subtracts them finds the same.
-        gaps = _rounded_up(self.optima.astype(np.float64) - expectations, dtype)
+        gaps = rounded_up(self.optima.astype(np.float64) - expectations, dtype)
         weighted = (gaps if weights is None else weights * gaps).astype(np.float64)
         worst = int(weighted.argmax())
         bound, share = weighted[worst], np.eye(len(gaps))[worst]
@@ -203,7 +203,7 @@ class Agreeing:
         parts = self._contributions(choices, own, share)
         parts[self._is_as_the_expert(policy)] = 0.0
         fields = {
-            "bound": _rounded_up(bound, dtype),
+            "bound": rounded_up(bound, dtype),
             "optima": self.optima,
             "expectations": expectations,
             "gaps": gaps,
@@ -245,10 +245,6 @@ def _checked_weights(mdp: MDP, weights: Any) -> Float[np.ndarray, " K"]:
 def _sum_up(terms: Float[np.ndarray, " K"]) -> float:
     """A sum, rounded up."""
     return terms.sum() + (len(terms) + 4) * np.finfo(np.float64).eps * np.abs(terms).sum()
-
-
-def _rounded_up(numbers: Float[ArrayLike, "..."], dtype: np.dtype) -> Float[np.ndarray, "..."]:
-    return -rounded_down(-np.asarray(numbers, np.float64), dtype)
 
 
 def _in_words(loss: LossBound) -> str:

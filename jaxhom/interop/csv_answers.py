@@ -5,11 +5,14 @@ Columns, delimiters and names of states and actions are as in `csv_steps`.
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxhom.interop.archives import FileError
 from jaxhom.interop.csv_rows import read_table
 from jaxhom.interop.csv_steps import column_of_indices, places_of
 from jaxhom.interop.numbering import NO_ACTION, numberings
@@ -62,11 +65,13 @@ def answers_from_csv(path: str | os.PathLike, *, mdp: MDP) -> tuple[Int[np.ndarr
     return states[actions >= 0], actions[actions >= 0]
 
 
-def append_answer(path: str | os.PathLike, state: int, action: int) -> None:
+def append_answer(path: str | os.PathLike, state: int, action: int, *, mdp: MDP) -> None:
     """Adds a line to a file of answers, in its columns; begins the file if there is none.
 
+    State and action are written as `answers_from_csv` reads them with the same model: by name where a name is a number.
+
     Raises:
-      FileError: if the file is no text or lacks a column.
+      FileError: if the file is no text, compressed, or lacks a column, or has others that blanks cannot leave empty.
       OSError: if it cannot be written.
     """
     header, delimiter, is_new = list(_COLUMNS), ",", not os.path.exists(path) or not os.path.getsize(path)
@@ -74,12 +79,23 @@ def append_answer(path: str | os.PathLike, state: int, action: int) -> None:
     if not is_new:
         table = read_table(path)
         header, delimiter, places = table.header, table.delimiter or " ", places_of(table, _COLUMNS)
+        if delimiter == " " and len(header) > len(_COLUMNS):
+            raise FileError(f"{path}: an answer has no more than {' and '.join(_COLUMNS)} to write between blanks")
     fields = [""] * len(header)
-    fields[places["state"]], fields[places["action"]] = str(state), str(action)
+    of_states, of_actions = numberings(mdp)
+    fields[places["state"]], fields[places["action"]] = of_states.text_of(state), of_actions.text_of(action)
     with open(path, "a+b") as file:
-        lines = [delimiter.join(fields), ""]
+        if file.seek(0) == 0 and file.read(2) == b"\x1f\x8b":
+            raise FileError(f"{path}: it is compressed, and nothing can be added to it")
+        lines = [_line(fields, delimiter), ""]
         if is_new:
-            lines = [delimiter.join(header), *lines]
+            lines = [_line(header, delimiter), *lines]
         elif file.seek(-1, os.SEEK_END) and file.read() not in (b"\n", b"\r"):
             lines = ["", *lines]
         file.write("\n".join(lines).encode())
+
+
+def _line(fields: list[str], delimiter: str) -> str:
+    written = io.StringIO()
+    csv.writer(written, delimiter=delimiter, lineterminator="").writerow(fields)
+    return written.getvalue()

@@ -118,6 +118,9 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         checks.require_shape("final_states", final, f"({count},)", final.shape == (count,))
         if (mask != steps).any():  # hidden steps; text is left to the checks below
             actions = np.where(mask, actions, 0)
+            shown = np.where(mask.any(axis=1), horizon - mask[:, ::-1].argmax(axis=1), length)
+            final = np.where(shown < length, states[np.arange(count), np.minimum(shown, horizon - 1)], final)
+            length = shown  # the state after the last step that is shown is the final one
         rows = zip(states, actions, length, final, strict=True)
         trajectories = [(np.append(s[:n], z) if z != -1 else s[:n], a[:n]) for s, a, n, z in rows]
         is_answer = arrays.get("is_answer", np.zeros(count, bool))

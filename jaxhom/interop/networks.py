@@ -25,6 +25,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.interop.archives import FileError
 from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries
+from jaxhom.interop.numbering import whole_of
 from jaxhom.interop.text_files import errors_of, open_text, without_gz
 from jaxhom.interop.text_tables import TextTable, numbered
 
@@ -326,7 +327,7 @@ def _columns(path: str | os.PathLike) -> tuple[list, list, np.ndarray | None]:
 
 def _whole_numbers(columns: list[list]) -> list[list]:
     """Columns of texts as whole numbers; `ValueError` if one is none."""
-    return [[*map(int, texts)] for texts in columns]
+    return [[*map(whole_of, texts)] for texts in columns]
 
 
 def _have_names(columns: list[list]) -> bool:

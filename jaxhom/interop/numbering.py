@@ -9,6 +9,7 @@ name if one of the names is a whole number, and else an index.
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -57,6 +58,14 @@ class Numbering:
         if not 0 <= number < self.limit:
             raise ValueError(f"must lie in [0, {self.limit}), got {text}")
         return number
+
+    def text_of(self, index: int) -> str:
+        """A text that means this index: the number itself, unless that is somebody's name."""
+        for text in (str(index), *(map(str, self.names[index : index + 1]) if self.names is not None else ())):
+            with contextlib.suppress(ValueError):
+                if self.index_of_text(text) == index:
+                    return text
+        raise ValueError(f"no text says {self.kind} {index}, which has the name of another")
 
     def indices(self, name: str, values: Any) -> np.ndarray:
         """The indices [H] of states or actions as arrays, lists, texts or names; `name` is what messages call them.
@@ -214,6 +223,17 @@ def whole_number(text: str) -> int | None:
     except ValueError:
         return None
     return int(number) if number.is_integer() and "_" not in text else None
+
+
+def whole_of(text: str | int) -> int:
+    """The whole number that a text is; Python's underscores are no digits, as in names like 1_12.
+
+    Raises:
+      ValueError: if it is none.
+    """
+    if "_" in str(text):
+        raise ValueError(f"not a whole number: {text!r}")
+    return int(text)
 
 
 def indices_by_cell(cells: Sequence[str], index: Callable[[str], int]) -> np.ndarray:

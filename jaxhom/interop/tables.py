@@ -19,7 +19,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.interop.archives import FileError
 from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
-from jaxhom.interop.numbering import whole_number
+from jaxhom.interop.numbering import whole_number, whole_of
 from jaxhom.interop.text_files import errors_of
 from jaxhom.interop.text_tables import TextTable
 
@@ -107,7 +107,7 @@ def _of_file(path: str | os.PathLike, discount, columns: dict[str, Hashable]) ->
 def _whole(text: str) -> int:
     """3, and 3.0 as programs write columns of integers that are floats to them."""
     try:
-        return int(text)
+        return whole_of(text)
     except ValueError:
         number = whole_number(text)
         if number is None or abs(number) >= _TOO_LARGE:

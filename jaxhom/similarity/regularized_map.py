@@ -49,10 +49,11 @@ def homomorphism_map(
       anchored: require that the centre is mapped to the centre.
 
     Returns:
-      f [n, m], rows sum to 1; NaN where 100,000 iterations do not find it. Works under `jit`, `vmap` and `grad`.
+      f [n, m], rows sum to 1; NaN where 100,000 iterations do not find it. Works under `jit`, `vmap` and `grad` of the
+      two models; the options must be concrete.
 
     Raises:
-      ValueError: if the shapes do not fit or `regularization` is not positive.
+      ValueError: if the shapes do not fit, or `regularization` is traced or not positive.
 
     Example:
       >>> import jaxhom, numpy as np
@@ -64,10 +65,12 @@ def homomorphism_map(
     """
     source, target = jnp.asarray(source), jnp.asarray(target)
     checks.require_model_pair(source, target)
+    checks.refuse_traced(regularization=regularization, anchored=anchored)
+    regularization = checks.require_number("regularization", regularization)
     if not regularization > 0:
         raise ValueError(f"regularization must be positive, got {regularization}")
     dtype = jnp.promote_types(jnp.result_type(source, target), jnp.float32)
-    return _map(source.astype(dtype), target.astype(dtype), regularization, anchored)
+    return _map(source.astype(dtype), target.astype(dtype), regularization, bool(anchored))
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))

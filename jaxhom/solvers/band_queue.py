@@ -5,9 +5,9 @@ As `lane_queue`, with the lanes first. On a CPU, a program with few lanes runs o
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import jax
@@ -16,14 +16,14 @@ import numpy as np
 from jaxhom.programs import host_jit
 from jaxhom.solvers.band_interior_point import Iterate, Lanes, Point, begin, run
 from jaxhom.solvers.band_system import BandSystem
-from jaxhom.solvers.lane_queue import num_cores
+from jaxhom.solvers.lane_queue import num_cores, work_on
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 _SHARE = 0.25  # of the lanes that end a program
 _MOST_ENTRIES = 2**27  # of the factors of a program: 1 GB
-WIDTH = 1  # lanes of a program on a CPU: on grid16 4 or 8 took twice as long per lane and step
+_WIDTH = 1  # lanes of a program on a CPU: on grid16 4 or 8 took twice as long per lane and step
 
 
 def solve_lanes(
@@ -44,12 +44,7 @@ def solve_lanes(
     on_cpu = jax.default_backend() == "cpu"
     workers = min(num_cores() if on_cpu else 1, queue.total)
     width = _width(system, queue.total, workers, on_cpu)
-    if workers == 1:
-        _drain(queue, system, initial, width)
-    else:
-        with ThreadPoolExecutor(workers) as threads:
-            for future in [threads.submit(_drain, queue, system, initial, width) for _ in range(workers)]:
-                future.result()
+    work_on(queue, functools.partial(_drain, queue, system, initial, width), workers)
     return queue.results
 
 
@@ -57,7 +52,7 @@ def _width(system: BandSystem, total: int, workers: int, on_cpu: bool) -> int:
     """Lanes of a program: 1 or 2, 4, 8, ..., so that few are compiled."""
     count, size, num_features = system.border.shape
     entries = count * size * (3 * size + 2 * num_features)
-    most = max(1, min(WIDTH if on_cpu else 64, _MOST_ENTRIES // entries))
+    most = max(1, min(_WIDTH if on_cpu else 64, _MOST_ENTRIES // entries))
     wanted = min(most, -(-total // workers))
     return 1 << (wanted.bit_length() - 1)
 
@@ -75,6 +70,11 @@ class _Queue:
         with self._lock:
             first, self._waiting = self._waiting, min(self.total, self._waiting + count)
             return np.arange(first, self._waiting)
+
+    def close(self) -> None:
+        """Nobody takes another lane."""
+        with self._lock:
+            self._waiting = self.total
 
     def store(self, state: Iterate, numbers: np.ndarray) -> None:
         """Keeps what lanes have come to."""

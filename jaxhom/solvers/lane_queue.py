@@ -84,17 +84,30 @@ def solve_many(
     def work() -> None:
         _drain(queue, solver, lanes, devices, tolerance, max_iterations, report)
 
+    work_on(queue, work, workers)
+    return queue.results
+
+
+def work_on(queue: Any, work: Callable[[], None], workers: int) -> None:
+    """Has threads work on a queue, or this one if it is one; if any fails, the queue closes, so that all end soon."""
+
+    def until_one_fails() -> None:
+        try:
+            work()
+        except BaseException:
+            queue.close()
+            raise
+
     if workers == 1:
         work()
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            try:
-                for future in [pool.submit(work) for _ in range(workers)]:
-                    future.result()
-            except BaseException:
-                queue.close()
-                raise
-    return queue.results
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for future in [pool.submit(until_one_fails) for _ in range(workers)]:
+                future.result()
+        except BaseException:  # what interrupts this thread interrupts nobody else
+            queue.close()
+            raise
 
 
 def _num_workers(devices: Sequence[jax.Device]) -> int:

@@ -31,12 +31,12 @@ class Shipped:
 
     def __call__(self, given: Any) -> Any:
         """Calls it; floats are as wide as those of the caller."""
-        if jax.config.jax_enable_x64 != self.x64:  # type: ignore[attr-defined]
-            jax.config.update("jax_enable_x64", self.x64)
         return self.load()(given)
 
     def load(self) -> Callable:
-        """The callable, the same one in every call of a process."""
+        """The callable, the same one in every call of a process; arrays in it keep their width."""
+        if jax.config.jax_enable_x64 != self.x64:  # type: ignore[attr-defined]
+            jax.config.update("jax_enable_x64", self.x64)
         return _load(self.pickled)
 
 

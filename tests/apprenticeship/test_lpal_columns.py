@@ -58,14 +58,6 @@ def test_the_pool_keeps_what_it_was_given():
     np.testing.assert_array_equal(pool.mixture([0], [1.0]), np.arange(6.0)[:, None] * [0.0, 1.0])
 
 
-def test_one_hot():
-    case = small_models.case("absorbing")
-    actions = np.random.default_rng(0).integers(2, size=(3, 6)).astype(np.uint8)
-    policy = PolicyPool(case.mdp).one_hot(actions)
-    assert policy.dtype == case.mdp.dtype
-    np.testing.assert_array_equal(policy, np.eye(2)[actions])
-
-
 # ------------------------------------------------------------------------------------------ games
 
 WIDTH = 5

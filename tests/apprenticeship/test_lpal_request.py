@@ -192,3 +192,10 @@ def test_what_a_method_takes_for_closed_is_certified():
     assert len(seen) == 2
     np.testing.assert_array_equal(found.iterations, 5)
     np.testing.assert_array_equal(found.stopped, Status.ITERATION_LIMIT)
+
+
+def test_a_start_from_another_model_is_named():
+    small, large = (jaxhom.gridworld(size, num_regions=4).mdp for size in (4, 6))
+    found = jaxhom.lpal(small, np.zeros(4))
+    with pytest.raises(ValueError, match=r"warm_start.policy must have shape"):
+        jaxhom.lpal(large, np.zeros(4), warm_start=found)

@@ -13,7 +13,7 @@ import scipy.optimize
 import small_models
 
 import jaxhom
-from jaxhom.apprenticeship import causal_entropy
+from jaxhom.apprenticeship import causal_entropy, descent
 from jaxhom.apprenticeship.causal_entropy import Evidence, HostObjective, objective_in_program, scaled_features
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.host_chains import host_model
@@ -308,3 +308,17 @@ def test_a_model_without_features_is_refused():
     mdp = MDP.from_dense(np.eye(2)[:, None], discount=0.9)
     with pytest.raises(ValueError, match="no features"):
         jaxhom.max_causal_entropy(mdp, jaxhom.Demonstrations.from_trajectories([([0], [0])]))
+
+
+@pytest.mark.parametrize("optimizer", [None, optax.sgd(0.1)], ids=["default", "of the user"])
+def test_programs_are_compiled_once_per_optimiser(optimizer):
+    mdp = jaxhom.gridworld(4, num_regions=4).mdp
+
+    def learn(expectations):
+        return jaxhom.max_causal_entropy(mdp, expectations=expectations, optimizer=optimizer, max_iterations=3).weights
+
+    before = []
+    for _ in range(3):
+        jax.vmap(learn)(jnp.ones((2, 4)))
+        before.append(descent._descend._cache_size())
+    assert len(set(before)) == 1

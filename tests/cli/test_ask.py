@@ -1,6 +1,8 @@
 """`ask`: questions to standard input, to files and to the optimal policy; what it tells, keeps and refuses."""
 
+import gzip
 import io
+import itertools
 import re
 
 import numpy as np
@@ -246,7 +248,7 @@ def test_answers_that_are_not_allowed_name_the_line(tmp_path):
 def test_a_file_of_answers_grows_by_lines(tmp_path):
     mdp, path = jaxhom.gridworld(3).mdp, tmp_path / "said.csv"
     for state, action in ((1, 2), (8, 0)):
-        append_answer(path, state, action)
+        append_answer(path, state, action, mdp=mdp)
     assert path.read_bytes() == b"state,action\n1,2\n8,0\n"
     states, actions = answers_from_csv(path, mdp=mdp)
     assert (states.tolist(), actions.tolist()) == ([1, 8], [2, 0])
@@ -254,7 +256,31 @@ def test_a_file_of_answers_grows_by_lines(tmp_path):
     assert answers_from_csv(path, mdp=mdp)[0].shape == (0,)
     path.write_text("state\n")
     with pytest.raises(FileError, match="'action' is missing"):
-        append_answer(path, 1, 1)
+        append_answer(path, 1, 1, mdp=mdp)
+
+
+@pytest.mark.parametrize("names", [(1, 2, 3), ("2", "10", "a"), ("0, 1", "1", 'say "2"')], ids=str)
+def test_answers_come_back_where_names_are_numbers(tmp_path, names):
+    mdp = jaxhom.MDP.from_dense(np.full((3, 2, 3), 1 / 3), discount=0.9)
+    mdp = mdp.replace(state_names=names, action_names=(2, 1))
+    path = tmp_path / "said.csv"
+    pairs = list(itertools.product(range(3), range(2)))
+    for state, action in pairs:
+        append_answer(path, state, action, mdp=mdp)
+    assert list(zip(*answers_from_csv(path, mdp=mdp), strict=True)) == pairs
+
+
+def test_a_file_that_cannot_be_added_to_stays_as_it_is(tmp_path):
+    mdp = jaxhom.gridworld(3).mdp
+    for name, content, message in (
+        ("said.csv.gz", gzip.compress(b"state,action\n1,2\n"), "compressed"),
+        ("said.txt", b"who state action\nme 1 2\n", "between blanks"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(FileError, match=message):
+            append_answer(path, 1, 1, mdp=mdp)
+        assert path.read_bytes() == content
 
 
 def test_every_criterion_can_be_chosen(files):

@@ -240,6 +240,21 @@ def test_what_is_no_policy_of_the_target_is_refused(policy, message):
         soft_homomorphism(source, target, max_iterations=16).pull_back(policy)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_iterations": 0}, "max_iterations must be at least 1"),
+        ({"max_iterations": 1.5}, "max_iterations must be a whole number"),
+        ({"tolerance": "1e-3"}, "tolerance must be a number"),
+        ({"tolerance": -1.0}, "tolerance must be positive"),
+    ],
+)
+def test_how_long_to_look_is_checked(options, message):
+    source, target, _ = pair("no labels")
+    with pytest.raises(ValueError, match=message):
+        soft_homomorphism(source, target, **options)
+
+
 # ------------------------------------------------------------------------------------- what does not fit
 
 

@@ -270,7 +270,7 @@ def test_answers_in_any_delimiter_and_by_name(tmp_path):
     path.write_text("who; act; obs\nme; repair; worn out\nme; ; new\nme; 0; (0, 1)\n")
     states, actions = answers_from_csv(path, mdp=named_machine())
     assert (states.tolist(), actions.tolist()) == ([2, 1], [1, 0])
-    append_answer(path, 0, 1)
+    append_answer(path, 0, 1, mdp=named_machine())
     assert path.read_text().splitlines()[-1] == ";1;0"
     states, actions = answers_from_csv(path, mdp=named_machine())
     assert (states.tolist(), actions.tolist()) == ([2, 1, 0], [1, 0, 1])

@@ -239,6 +239,16 @@ def test_hidden_steps_stay_hidden_in_files(tmp_path, mask):
         assert (file["actions"] == -1).sum() == (~mask[:, : mask[0].nonzero()[0].max() + 1]).sum()
 
 
+def test_where_the_last_steps_are_hidden_the_state_after_those_shown_is_the_final_one(tmp_path):
+    path = tmp_path / "demos.npz"
+    np.savez(path, states=[[3, 1, 2], [0, 1, 0]], actions=[[1, -1, -1], [1, 0, 1]], final_states=[4, 2])
+    loaded = load_demonstrations(path)
+    assert loaded.mask.tolist() == [[True, False, False], [True, True, True]]
+    assert loaded.final_states.tolist() == [1, 2]
+    save_demonstrations(path, loaded)
+    assert load_demonstrations(path).final_states.tolist() == [1, 2]
+
+
 def test_trajectories_without_a_step_are_not_saved(tmp_path):
     broken = Demonstrations(states=jnp.zeros((1, 3), int), actions=jnp.zeros((1, 3), int), mask=jnp.zeros((1, 3), bool))
     with pytest.raises(ValueError, match=r"mask\[0\] must be True on one step of each trajectory at least"):

@@ -156,6 +156,12 @@ def test_both_directions_texts_and_several_links(tmp_path):
     assert from_edges(path, discount=0.9, states="nodes").terminal.tolist() == [False, False, True]
 
 
+def test_names_with_underscores_are_no_numbers(tmp_path):
+    path = tmp_path / "roads.edgelist"
+    path.write_text("1_12 11_2\n11_2 1_12\n")
+    assert from_edges(path, discount=0.9, states="nodes").state_names == ("1_12", "11_2")
+
+
 def test_links_that_begin_where_they_end(tmp_path):
     """Without direction, too, each of them is one."""
     path = tmp_path / "roads.edgelist"

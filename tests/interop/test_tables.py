@@ -94,6 +94,11 @@ def test_whole_numbers_are_in_the_order_of_numbers(tmp_path):
         assert names == ("0", other)
 
 
+def test_names_with_underscores_are_no_numbers(tmp_path):
+    table = written(tmp_path, "state,action,next\n1_12,0,11_2\n11_2,0,1_12\n")
+    assert from_table(table, discount=0.9).state_names == ("11_2", "1_12")
+
+
 def test_tables_of_the_robust_kind_and_columns_of_other_names(tmp_path):
     names = ("idstatefrom", "idaction", "idstateto", "probability", "reward")
     text = numbered().set_axis(names, axis=1).to_csv(index=False)

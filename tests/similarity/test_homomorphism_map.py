@@ -89,5 +89,9 @@ def test_rejections():
     source, target = pair(0)
     with pytest.raises(ValueError, match="regularization must be positive"):
         homomorphism_map(source, target, regularization=0.0)
+    for option in ("regularization", "anchored"):
+        with pytest.raises(ValueError, match=f"{option} is a traced value"):
+            jax.jit(lambda value, name=option: homomorphism_map(source, target, **{name: value}))(1.0)
+    np.testing.assert_array_equal(homomorphism_map(source, target, regularization=jnp.float64(0.05)).shape, (3, 2))
     with pytest.raises(ValueError, match=r"target must have shape \[m, 2, m\]"):
         homomorphism_map(source, jnp.ones((2, 3, 2)) / 2)

@@ -2,6 +2,9 @@
 
 import dataclasses
 import functools
+import itertools
+import threading
+import types
 
 import chex
 import jax
@@ -15,7 +18,7 @@ from jaxhom.similarity import interior_point
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem, plain_adjoint, plain_forward
 from jaxhom.solvers import pdhg, projections
 from jaxhom.solvers.game_pdhg import MatrixGame
-from jaxhom.solvers.lane_queue import is_settled, solve_many
+from jaxhom.solvers.lane_queue import is_settled, solve_many, work_on
 from jaxhom.solvers.pdhg import SOLVER, PDHGState
 from jaxhom.solvers.projections import project_l1_ball, project_simplex, reduce_leading
 from jaxhom.status import Status
@@ -568,6 +571,21 @@ def test_many_problems_through_sixteen_lanes(total):
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(state))
     assert_brackets(state, values[order])
     assert np.all(state.upper - state.lower <= tolerance)
+
+
+@pytest.mark.parametrize("fails", [0, 1])
+def test_one_worker_that_fails_ends_the_others(fails):
+    """Whichever is waited for first: nobody takes another lane."""
+    closed, number = threading.Event(), itertools.count()
+
+    def work():
+        if next(number) == fails:
+            raise RuntimeError("stop")
+        assert closed.wait(60.0)
+
+    with pytest.raises(RuntimeError, match="stop"):
+        work_on(types.SimpleNamespace(close=closed.set), work, 2)
+    assert closed.is_set()
 
 
 def test_many_problems_agree_with_each_alone():

@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import functools
 import multiprocessing
 import os
 import pickle
@@ -21,7 +22,7 @@ from interrupt_often import watching
 from sweep_works import NUMBERS, deadly, expected, found, scaled
 
 from jaxhom import sweeps
-from jaxhom.sweeps import crews, dispatch
+from jaxhom.sweeps import attempts, crews, dispatch
 from jaxhom.sweeps.cases import checked_jobs
 
 
@@ -82,6 +83,23 @@ def test_processes_compute_in_the_callers_floats_and_are_replaced(tmp_path):
     (tmp_path / "again").mkdir()
     work, wide = float_type, jax.config.jax_enable_x64
     assert wide and run(work, [{"x": 1}], tmp_path / "again", executor=Elsewhere())[0]["dtype"] == "float64"
+
+
+def in_array(array, case):
+    """An array that travels with the work."""
+    return {"y": float(array[0]), "dtype": str(array.dtype)}
+
+
+def test_arrays_that_travel_with_the_work_keep_their_width():
+    """Also to a worker that somebody else started, in which floats are narrow until the first case."""
+    work = attempts.ship(functools.partial(in_array, jnp.array([0.1])))
+    attempts._load.cache_clear()
+    jax.config.update("jax_enable_x64", False)
+    try:
+        (row,) = attempts.attempt(work, {"x": 1}, is_batch=False)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert (row["y"], row["dtype"], row["x64"]) == (0.1, "float64", True)
 
 
 class Fragile(Executor):

@@ -5,6 +5,7 @@ in `report.md`. Says which figures that the README and the docs quote are out of
 """
 
 import argparse
+import collections
 import pathlib
 import sys
 from collections.abc import Callable, Sequence
@@ -223,12 +224,15 @@ def _health(rows: Sequence[Row]) -> str:
     solved = [row for row in good if row.status not in ("", "none")]
     unsolved = sum(row.status != "SOLVED" for row in solved)
     gaps = [row.certificate for row in solved if row.certificate is not None]
-    hours = sum(row.seconds or 0.0 for row in rows) / 3600
+    hours, by_method = sum(row.seconds or 0.0 for row in rows) / 3600, collections.Counter()
+    for row in rows:
+        by_method[row.method] += (row.seconds or 0.0) / 3600
+    longest = ", ".join(f"{name} {part / hours:.0%}" for name, part in by_method.most_common(3) if hours)
     commits = ", ".join(sorted({row.commit for row in rows if row.commit}))
     return (
         f"{len(rows)} rows: {len(settings)} settings, up to {draws} draws each; {len(rows) - len(good)} failed; "
         f"{unsolved} of {len(solved)} solver runs short of their tolerance, largest certificate "
-        f"{max(gaps, default=float('nan')):.1e} per step; {hours:.2f} h of solver time; commit {commits}."
+        f"{max(gaps, default=float('nan')):.1e} per step; {hours:.2f} h of solver time ({longest}); commit {commits}."
     )
 
 

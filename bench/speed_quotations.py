@@ -200,14 +200,10 @@ def _planning(rows: _Rows) -> Iterator[str]:
         return ours, _digits(number(other, "seconds"))
 
     grid, large = (pair(section, "planning", "quantecon") for section in ("grid48", "grid316"))
+    each = rows.ours(section="grid316", work="planning", lanes="32")
     yield (
         f"Planning for one reward takes {grid[0]} s on the 48x48 grid and {large[0]} s on 100,000 states (QuantEcon "
-        f"{grid[1]} and {large[1]})."
+        f"{grid[1]} and {large[1]}); of 32 rewards there, {each} s each."
     )
-    grid, track, garnet = (
-        pair(section, "occupancy", "scipy") for section in ("grid48", "racetrack_a", "garnet_sparse")
-    )
-    yield (
-        f"Occupancies of one policy take {grid[0]} s on that grid, {track[0]} s on racetrack (a) and {garnet[0]} s on "
-        f"a sparse random model of 10,000 states (SciPy {grid[1]}, {track[1]} and {garnet[1]})."
-    )
+    grid, large = (pair(section, "occupancy", "scipy") for section in ("grid48", "grid316"))
+    yield f"Occupancies of one policy take {grid[0]} and {large[0]} s (SciPy's sparse LU {grid[1]} and {large[1]})."

@@ -12,7 +12,7 @@ def quoted():
 
 def test_pages_say_what_the_rows_say(quoted):
     assert [one.passage for one in quoted if not one.is_up_to_date] == []
-    pages = {"README.md", "docs/which_method.md", "docs/scale.md", "docs/sweeps.md"}
+    pages = {"README.md", *(f"docs/{name}.md" for name in ("which_method", "relations", "scale", "sweeps"))}
     assert {one.page for one in quoted} == pages and len(quoted) > 50
 
 

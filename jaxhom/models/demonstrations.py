@@ -320,7 +320,11 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
 
 def _expected(mdp: MDP, demonstrations: Demonstrations) -> tuple[Float[Array, " K"], Bool[Array, " M"]]:
     walks = ~demonstrations.is_answer
-    demonstrations = demonstrations.replace(mask=demonstrations.mask & walks[:, None])
+    demonstrations = demonstrations.replace(
+        mask=demonstrations.mask & walks[:, None],
+        terminated=demonstrations.terminated & walks,
+        final_states=jnp.where(walks, demonstrations.final_states, -1),
+    )
     steps = jnp.arange(demonstrations.horizon)
     weight = jnp.where(demonstrations.mask, mdp.discount**steps, 0.0)
     # Weights are summed per pair first: [M, H, K] would not fit for long demonstrations and many features.

@@ -121,7 +121,7 @@ def check_reward(
     Args:
       mdp: the model.
       reward: [S, A], or [B, S, A] beside a batch of policies.
-      policy_shape: (S, A) or (B, S, A).
+      policy_shape: (S, A) or (B, S, A), or (S,) of actions.
 
     Raises:
       ValueError: if the shape does not fit, or a concrete value is not finite.
@@ -129,7 +129,7 @@ def check_reward(
     pair = (mdp.num_states, mdp.num_actions)
     if not checks.is_traced(reward):
         reward = checks.as_host_array("reward", reward)
-    good = reward.shape in (pair, tuple(policy_shape))
+    good = reward.shape == pair or (len(policy_shape) == 3 and reward.shape == tuple(policy_shape))
     checks.require_shape("reward", reward, f"{pair} or the policy's", good)
     return check_reward_values(mdp, reward)
 

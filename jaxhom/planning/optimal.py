@@ -33,8 +33,9 @@ from jaxhom.status import Status
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Float, Int
 
-# From here on factors take longer than the sweeps that the discount needs at most, 23,000 for ten digits at 0.999.
-_SOLVED_STATES, _SWEPT_DISCOUNT = 200_000, 0.999
+# States from which on factors take longer than the sweeps that a discount needs at most, for ten digits 23,000 at 0.999
+# and 2,300 at 0.99, where 100,000 states (grid316 of results/speed_planning.csv) took 2.9 s by policy iteration.
+_SWEPT = ((200_000, 0.999), (50_000, 0.99))
 _POLISHED_STATES = 20_000  # up to which ties are settled by policy iteration: its factors grow faster than sweeps do
 
 
@@ -151,7 +152,7 @@ def _plan_at_hand(
     mdp: MDP, reward, value, tolerance, *, max_iterations: int, is_polished: bool, report: Callable | None
 ) -> Plan:
     """The plan for concrete arrays, batch last: by sweeps on the device, policy iteration on the host, or both."""
-    if mdp.num_states > _SOLVED_STATES and float(mdp.discount) <= _SWEPT_DISCOUNT:
+    if any(mdp.num_states > states and float(mdp.discount) <= discount for states, discount in _SWEPT):
         options = {"max_iterations": max_iterations, "is_quick": True, "is_patient": True, "report": report}
         return plan_in_program(mdp, reward, value, tolerance, **options)[0]
     model, host_reward = host_model(mdp), reward.astype(np.float64)

@@ -223,6 +223,7 @@ def agreement(
     if not checks.is_traced(weights):
         host = checks.require_floats("weights", np.asarray(weights))
         checks.require_all("weights", host, host >= 0, "must not be negative")
+        checks.require_all("sum of weights", host.sum(axis=-1), host.sum(axis=-1) > 0, "must be positive")
     batches = {len(a) for a, n in ((policy, 3), (expert_policy, 3), (weights, 2)) if a.ndim == n}
     if len(batches) > 1:
         raise ValueError(f"batches must be of one size, got {sorted(batches)}")

@@ -383,7 +383,7 @@ def test_options_out_of_range_are_refused(options, message):
         (lambda former: "solution", "warm_start must be an LPALSolution, got str"),
         (lambda former: former.replace(weights=np.ones(5)), r"warm_start.weights must have shape \(8, K\), got \(5,\)"),
         (lambda former: former.replace(weights=np.ones(6)), "sum of warm_start.weights must be 1"),
-        (lambda former: former.replace(policy=former.policy[:3]), r"initial_policy must have shape \(8, S, A\)"),
+        (lambda former: former.replace(policy=former.policy[:3]), r"warm_start.policy must have shape \(8, S, A\)"),
     ],
 )
 def test_warm_starts_that_do_not_fit_are_refused(change, message):

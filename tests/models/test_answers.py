@@ -179,3 +179,14 @@ def test_every_method_follows_them():
         general = function(grid, shown, *more)
         assert general.visited[9]
         np.testing.assert_allclose(general.policy[9], [2 / 3, 1 / 3, 0, 0], atol=1e-12)
+
+
+def test_an_answer_with_an_end_says_nothing_of_time():
+    """As files may hold them: the state after it is known, or that its episode ended there."""
+    mdp = gridworld(3, num_regions=9).mdp
+    walk = Demonstrations.from_trajectories([([0, 1, 2], [0, 2, 1])])
+    plain = walk.with_answers([4], [1])
+    ended = plain.replace(final_states=jnp.array([-1, 4]), terminated=jnp.array([False, True]))
+    expected = monte_carlo_feature_expectations(mdp, walk)
+    for shown in (plain, ended):
+        np.testing.assert_allclose(monte_carlo_feature_expectations(mdp, shown), expected)

@@ -454,7 +454,7 @@ def test_patient_sweeps_of_large_models(name, rng, monkeypatch, capsys):
     case = small_models.case(name)
     reward = rng.normal(size=case.shape[:2])
     plain = optimal_policy(case.mdp, reward)
-    monkeypatch.setattr("jaxhom.planning.optimal._SOLVED_STATES", 0)
+    monkeypatch.setattr("jaxhom.planning.optimal._SWEPT", ((0, 0.999),))
     patient = optimal_policy(case.mdp, reward, progress=True)
     np.testing.assert_allclose(patient.value, plain.value, atol=1e-7)
     assert patient.status == Status.SOLVED

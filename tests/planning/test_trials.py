@@ -13,6 +13,7 @@ from jaxhom.domains.racetrack import racetrack
 from jaxhom.models.dense_tensor import DenseTensor
 from jaxhom.models.mdp import MDP
 from jaxhom.planning import trials as evaluation
+from jaxhom.planning.occupancy import policy_value
 from jaxhom.planning.optimal import optimal_policy
 from jaxhom.planning.trials import agreement, evaluate_by_sampling, evaluate_exactly
 
@@ -366,6 +367,8 @@ def test_one_trial_has_no_standard_error(case, num_trials):
         ({"weights": np.ones((S, A, 1))}, "weights must have shape"),
         ({"weights": -np.ones(S)}, r"weights\[0\] must not be negative"),
         ({"weights": np.full(S, np.nan)}, r"weights\[0\] must be finite"),
+        ({"weights": np.zeros(S)}, "sum of weights must be positive"),
+        ({"weights": np.eye(2, S)[[0, 0]] * [[1], [0]]}, r"sum of weights\[1\] must be positive"),
         ({"policy": np.ones((2, S, A)), "weights": np.ones((3, S))}, "batches must be of one size"),
     ],
 )
@@ -373,3 +376,13 @@ def test_malformed_agreement_is_rejected(case, changes, message):
     arguments = {"policy": np.ones((S, A)), "expert_policy": np.ones((S, A))} | changes
     with pytest.raises(ValueError, match=message):
         agreement(case["mdp"], **arguments)
+
+
+@pytest.mark.parametrize("num_actions", [1, 2])
+def test_rewards_of_states_are_refused_beside_actions_too(num_actions):
+    """Where there are as many actions as states, or one, NumPy would spread them over actions."""
+    mdp = MDP.from_dense(np.full((2, num_actions, 2), 0.5), discount=0.9)
+    with pytest.raises(ValueError, match="reward must have shape"):
+        policy_value(mdp, np.zeros(2, int), np.ones(2))
+    with pytest.raises(ValueError, match="reward must have shape"):
+        evaluate_exactly(mdp, np.zeros(2, int), np.ones(2), 3)

@@ -128,7 +128,7 @@ def _first(rows: _Rows) -> Iterator[str]:
         rows.ours("first_s", section="steps", instance=step, cache="none")
         for step in ("the whole way", "LPAL", "planning")
     )
-    quantecon = rows.quickest(_is_first_of("quantecon"), "first_s", instance="planning")
+    quantecon = next(row for row in rows.rows if row["method"] == "quantecon")
     yield (
         f"The whole way from a model to the learned policy takes {way} s; LPAL on the 16x16 grid {lpal} s, planning "
         f"{planning} s (QuantEcon, with Numba's compilation, {_digits(number(quantecon, 'first_s'))})."
@@ -137,10 +137,6 @@ def _first(rows: _Rows) -> Iterator[str]:
         rows.ours(field, section="draws_grid16", method="jaxhom jit vmap") for field in ("seconds", "first_s")
     )
     yield f"As one program of a key the way takes {_digits(1000.0 * float(draw))} ms a draw, after {compiled} s of"
-
-
-def _is_first_of(method: str) -> Callable[[dict], bool]:
-    return lambda row: row["method"] == method
 
 
 def _lpal(rows: _Rows) -> Iterator[str]:

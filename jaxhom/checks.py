@@ -245,6 +245,23 @@ def require_count(name: str, value: Any, least: int = 1) -> int:
     return value
 
 
+def require_cell(name: str, cell: Any) -> tuple[int, int]:
+    """Returns `cell` as the numbers of a row and a column."""
+    try:
+        row, column = cell
+        return operator.index(row), operator.index(column)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be two whole numbers (row, column), got {in_one_line(cell)}") from None
+
+
+def require_flags(name: str, array: Any, count: int) -> Any:
+    """Returns `array`, traced or not, if it is bool [count]; raises otherwise."""
+    require_shape(name, array, f"({count},)", array.shape == (count,))
+    if array.dtype != bool:
+        raise ValueError(f"{name} must be bool, got dtype {array.dtype}")
+    return array
+
+
 def require_positive(name: str, value: Any, *, or_zero: bool = False) -> None:
     """Raises unless a number, or every number of an array, is positive where it is concrete."""
     if not is_traced(value):

@@ -19,7 +19,8 @@ _happened = False
 
 def watch_while_loading() -> None:
     """Ends the process with one line at Ctrl-C, if it is `python -m jaxhom` and its libraries are being loaded."""
-    is_loading = sys.argv[:1] == ["-m"] and "jaxhom" in sys.orig_argv
+    is_module = sys.argv[:1] == ["-m"] and "-m" in sys.orig_argv  # as long as it is looked for
+    is_loading = is_module and sys.orig_argv[sys.orig_argv.index("-m") + 1 :][:1] == ["jaxhom"]
     if is_loading and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave_at_once)
 

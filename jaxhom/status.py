@@ -211,7 +211,8 @@ def _shown_status(status: np.ndarray) -> str:
 
 def bracket(lower: float, upper: float) -> str:
     """`lower <= e <= upper` in six decimals."""
-    low, high = math.floor(lower * 1e6 + _SLACK) / 1e6, math.ceil(upper * 1e6 - _SLACK) / 1e6
+    low = math.floor(lower * 1e6 + _SLACK) / 1e6 if math.isfinite(lower) else lower
+    high = math.ceil(upper * 1e6 - _SLACK) / 1e6 if math.isfinite(upper) else upper
     return f"{low:.6g} <= e <= {high:.6g}"
 
 

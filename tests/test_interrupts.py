@@ -115,6 +115,24 @@ def test_an_error_of_ours_is_none(monkeypatch):
         main([])
 
 
+@pytest.mark.parametrize(
+    ("command", "is_ours"),
+    [
+        (["-m", "jaxhom", "learn"], True),
+        (["-X", "dev", "-m", "jaxhom"], True),
+        (["-m", "other", "jaxhom"], False),
+        (["-m", "other", "-m", "jaxhom"], False),
+        (["jaxhom"], False),
+    ],
+)
+def test_only_our_own_command_is_watched_while_it_loads(watched, monkeypatch, command, is_ours):
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(sys, "orig_argv", ["python", *command])
+    monkeypatch.setattr(sys, "argv", ["-m"] if "-m" in command else command)
+    interrupts.watch_while_loading()
+    assert (signal.getsignal(signal.SIGINT) is not signal.default_int_handler) == is_ours
+
+
 def test_a_parent_that_ignores_the_signal_is_obeyed(watched):
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     interrupts.watch()

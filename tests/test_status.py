@@ -17,6 +17,8 @@ def test_brackets_by_hand():
     assert bracket(0.0, 9.1e-13) == "0 <= e <= 1e-06"
     assert bracket(0.25, 0.25) == "0.25 <= e <= 0.25"
     assert bracket(0.1249999, 0.1250001) == "0.124999 <= e <= 0.125001"
+    assert bracket(-math.inf, math.inf) == "-inf <= e <= inf"
+    assert bracket(0.5, math.nan) == "0.5 <= e <= nan"
 
 
 @pytest.mark.parametrize(

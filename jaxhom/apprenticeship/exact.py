@@ -25,6 +25,7 @@ import numpy as np
 import scipy
 
 from jaxhom.models.mdp import MDP
+from jaxhom.planning import policy_iteration
 from jaxhom.planning.host_chains import host_model
 
 if TYPE_CHECKING:
@@ -167,6 +168,10 @@ class Exact:
             actions = None if actions is None else actions[None]
             return [part[0] for part in self._bound(reward, size, value[None], actions, len(weights))]
 
+        def backup(value):
+            action_value = own_reward + self.discount * (self.rows @ value).reshape(own_reward.shape)
+            return action_value if self._all_allowed else np.where(self.allowed, action_value, -np.inf)
+
         best = np.inf
         if value is not None and np.isfinite(value).all():
             value = np.clip(value, -size * self._most, size * self._most)
@@ -186,7 +191,7 @@ class Exact:
             best = min(best, bound)
             if open_ <= ENOUGH * tolerance or (greedy == actions).all():
                 break
-            actions = greedy
+            actions = policy_iteration.swept(self.model, backup, greedy, value)
         if not np.isfinite(best):
             best, _, actions = bound_of(value, None)
         return best, value, actions

@@ -87,9 +87,9 @@ def gridworld(
     Source: Boularias and Chaib-draa 2010, section VI.A.
     """
     size = checks.require_count("size", size)
-    if not 0.0 <= checks.as_host_array("noise", noise) <= 1.0:
+    if not 0.0 <= checks.require_number("noise", noise) <= 1.0:
         raise ValueError(f"noise must lie in [0, 1], got {noise}")
-    row, column = start
+    row, column = checks.require_cell("start", start)
     if not (0 <= row < size and 0 <= column < size):
         raise ValueError(f"start must be a cell of the {size} x {size} grid, got {tuple(start)}")
     coordinates = np.stack(np.divmod(np.arange(size * size), size), axis=-1)
@@ -141,8 +141,7 @@ def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
 
     Source: Boularias and Chaib-draa 2010, section VI.A.
     """
-    if num_regions < 1:
-        raise ValueError(f"num_regions must be at least 1, got {num_regions}")
+    num_regions = checks.require_count("num_regions", num_regions)
     return (_weights_at_hand if checks.is_at_hand(key) else _weights)(key, num_regions)
 
 
@@ -180,8 +179,8 @@ def _transition(coordinates, size: int, noise: float) -> tuple[np.ndarray, np.nd
 
 def _region_side(size: int, num_regions: int) -> int:
     """Returns the side of a region in cells, or raises."""
-    root = math.isqrt(max(num_regions, 0))
-    if root == 0 or root * root != num_regions or size % root:
+    root = math.isqrt(checks.require_count("num_regions", num_regions))
+    if root * root != num_regions or size % root:
         raise ValueError(
             f"num_regions must be a square number whose root divides the size: got {num_regions} for size {size}"
         )

@@ -247,10 +247,10 @@ def _start_cells(rows, grid, start) -> list[int]:
 
 def _cell_index(rows: tuple[str, ...], cell: Sequence[int], name: str) -> int:
     """The number of an open cell among the open cells, or raises."""
-    row, column = cell
+    row, column = checks.require_cell(name, cell)
     inside = 0 <= row < len(rows) and 0 <= column < len(rows[0])
     if not inside or rows[row][column] == "#":
         where = "a wall" if inside else f"outside the {len(rows)} x {len(rows[0])} map"
-        raise ValueError(f"{name} {tuple(cell)} is {where}")
+        raise ValueError(f"{name} {(row, column)} is {where}")
     before = "".join(rows[:row]) + rows[row][:column]
     return len(before) - before.count("#")

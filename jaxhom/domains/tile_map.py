@@ -58,6 +58,7 @@ class TileMap(Record):
             if not set(row) <= set("#.SF" + _VOID):
                 raise ValueError(f"rows[{number}] must be made of #, ., S, F and {_VOID}, got {row!r}")
         directions = checks.as_host_array("moves", moves)
+        checks.require_all("moves", directions, directions == np.round(directions), "must be whole")
         expected = f"({mdp.num_actions}, 2)"
         checks.require_shape("moves", directions, expected, directions.shape == (mdp.num_actions, 2))
         return cls(mdp=mdp, rows=rows, moves=tuple((int(row), int(column)) for row, column in directions))
@@ -78,11 +79,11 @@ class TileMap(Record):
         Raises:
           ValueError: if the cell is not on the map, or is no state.
         """
-        row, column = cell
+        row, column = checks.require_cell("cell", cell)
         height, width = len(self.rows), len(self.rows[0])
         if not (0 <= row < height and 0 <= column < width):
-            raise ValueError(f"cell {tuple(cell)} is outside the {height} x {width} map")
+            raise ValueError(f"cell {(row, column)} is outside the {height} x {width} map")
         if self.rows[row][column] == _VOID:
-            raise ValueError(f"cell {tuple(cell)} is no state of the model")
+            raise ValueError(f"cell {(row, column)} is no state of the model")
         before = "".join(self.rows[:row]) + self.rows[row][:column]
         return len(before) - before.count(_VOID)

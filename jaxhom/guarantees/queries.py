@@ -30,7 +30,6 @@ from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, absorbing_states
 from jaxhom.models.names import Names, described
-from jaxhom.models.trajectories import require_flags
 from jaxhom.planning.host_chains import host_model
 from jaxhom.planning.occupancy import has_occupancy, occupancy, policy_value
 from jaxhom.status import Record
@@ -169,7 +168,7 @@ def _askable(mdp: MDP, demonstrations, terminal, xp: ModuleType):
         askable = xp.zeros_like(askable)
     if terminal is not None:
         terminal = terminal if checks.is_traced(terminal) else checks.as_host_array("terminal", terminal)
-        askable = askable & ~require_flags("terminal", terminal, mdp.num_states)
+        askable = askable & ~checks.require_flags("terminal", terminal, mdp.num_states)
     return askable
 
 

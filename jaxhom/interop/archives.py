@@ -21,6 +21,17 @@ class FileError(ValueError):
 
 
 @contextlib.contextmanager
+def errors_of(path: str | os.PathLike) -> Iterator[None]:
+    """Within it whatever is wrong with a file's contents, a `ValueError`, becomes a `FileError` that names the file."""
+    try:
+        yield
+    except FileError:
+        raise
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from None
+
+
+@contextlib.contextmanager
 def whole_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """A file to write bytes to that is `path` once all is written: an interrupted write leaves no half of it there.
 

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.cassandra_statements import WILD, Rules, Statements, Things, number_of, start_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries, named
-from jaxhom.interop.text_files import errors_of
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float

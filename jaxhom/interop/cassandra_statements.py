@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxhom.interop.archives import FileError
+from jaxhom.interop.numbering import real_of
 from jaxhom.interop.text_files import open_text
 from jaxhom.models.construction import check_initial
 
@@ -217,7 +218,7 @@ def _plain(statements: Statements, times: Sequence[int], axes: Sequence[Things])
         values = np.array([*map(float, words[len(axes) :: width])])
     except ValueError:
         return _one_by_one(statements, times, axes)
-    if not np.isfinite(values).all():
+    if not np.isfinite(values).all() or any("_" in word for word in words[len(axes) :: width]):
         return _one_by_one(statements, times, axes)
     return np.array(columns).T, values, np.array(times)
 
@@ -315,12 +316,9 @@ def _require_count(words: list[str], count: int) -> None:
 
 def _number(word: str) -> float:
     try:
-        number = float(word)
+        return real_of(word)
     except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ValueError(f"expected a number, got {word!r}")
-    return number
+        raise ValueError(f"expected a number, got {word!r}") from None
 
 
 def number_of(statements: Statements, word: str) -> tuple[int, float] | None:

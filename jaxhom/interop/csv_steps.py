@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.column_names import find_columns, listed
 from jaxhom.interop.csv_rows import Table, read_table
 from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport
@@ -100,13 +100,11 @@ def demonstrations_from_csv(
         raise FileError(f"{path} {where}" if refusal.rows else f"{path} line 1: {refusal}") from None
     if "episode" not in values:
         names = range(len(rows.first))
-    try:
+    with errors_of(path):
         if mdp is None or "action" in values:
             demonstrations, report = assembled(rows, values, has_action, names)
         else:
             demonstrations, report = inferred_actions(mdp, rows.states(values, has_action), names, ambiguous)
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from None
     unread = [name.strip() for place, name in enumerate(table.header) if place not in places.values()]
     return demonstrations, dataclasses.replace(report, unread=tuple(unread))
 
@@ -154,11 +152,9 @@ def _states(table: Table, place: int, numbering: Numbering, to_states: Callable 
     if to_states is None:
         return column_of_indices(table, place, numbering)
     values = to_states(parsed(table.column(place)))
-    try:
+    with errors_of(table.path):
         indices = numbering.indices("to_states: states", values)
         checks.require_shape("to_states: states", indices, f"({len(table.lines)},)", len(indices) == len(table.lines))
-    except ValueError as error:
-        raise FileError(f"{table.path}: {error}") from None
     return indices
 
 

@@ -33,11 +33,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError, read_archive, require_arrays, write_archive
+from jaxhom.interop.archives import FileError, errors_of, read_archive, require_arrays, write_archive
 from jaxhom.interop.name_arrays import names_as_array, names_of
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.mdp import MDP
-from jaxhom.models.trajectories import require_flags
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float, Shaped
@@ -73,7 +72,7 @@ def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None =
             raise FileError(f"{path}: it has a discount of its own, {checks.in_one_line(arrays['discount'].tolist())}")
         arrays["discount"] = np.asarray(discount)
     require_arrays(path, arrays, "discount")
-    try:
+    with errors_of(path):
         options |= {name: names_of(name, arrays[name]) for name in ("state_names", "action_names") if name in arrays}
         if "transition" in arrays:
             return MDP.from_dense(arrays["transition"], discount=arrays["discount"], **options)
@@ -81,10 +80,6 @@ def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None =
             raise ValueError("neither transition nor next_state and probability are in it")
         require_arrays(path, arrays, "next_state", "probability")
         return MDP.from_successors(arrays["next_state"], arrays["probability"], discount=arrays["discount"], **options)
-    except FileError:
-        raise
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from None
 
 
 def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
@@ -104,7 +99,7 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
     """
     arrays = read_archive(path)
     require_arrays(path, arrays, "states", "actions")
-    try:
+    with errors_of(path):
         states, actions = np.atleast_2d(arrays["states"]), np.atleast_2d(arrays["actions"])
         checks.require_shape("states", states, "[M, H]", states.ndim == 2)
         checks.require_shape("actions", actions, str(states.shape), actions.shape == states.shape)
@@ -124,14 +119,11 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         rows = zip(states, actions, length, final, strict=True)
         trajectories = [(np.append(s[:n], z) if z != -1 else s[:n], a[:n]) for s, a, n, z in rows]
         is_answer = arrays.get("is_answer", np.zeros(count, bool))
-        checks.require_all(
-            "is_answer", is_answer, ~require_flags("is_answer", is_answer, count) | (length == 1), _ALONE
-        )
+        is_answer = checks.require_flags("is_answer", is_answer, count)
+        checks.require_all("is_answer", is_answer, ~is_answer | (length == 1), _ALONE)
         demonstrations = Demonstrations.from_trajectories(trajectories, terminated=arrays.get("terminated"))
         mask = checks.to_device(mask[:, : demonstrations.horizon])
         return demonstrations.replace(mask=mask, is_answer=checks.to_device(is_answer))
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from None
 
 
 def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
@@ -169,10 +161,8 @@ def load_policy(path: str | os.PathLike) -> Float[np.ndarray, "S A"]:
     """
     arrays = read_archive(path)
     require_arrays(path, arrays, "policy")
-    try:
+    with errors_of(path):
         return _validated_policy(arrays["policy"])
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from None
 
 
 def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:

@@ -17,9 +17,9 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.domains.tile_map import TileMap
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
-from jaxhom.interop.text_files import errors_of, open_text, require_letters
+from jaxhom.interop.text_files import open_text, require_letters
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float

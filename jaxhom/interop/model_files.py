@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.cassandra import from_cassandra
 from jaxhom.interop.files import load_arrays, load_mdp
 from jaxhom.interop.gridworld_files import from_gridworld
@@ -18,7 +18,7 @@ from jaxhom.interop.networks import from_edges
 from jaxhom.interop.octile import from_octile
 from jaxhom.interop.prism import from_prism
 from jaxhom.interop.tables import from_table
-from jaxhom.interop.text_files import errors_of, without_gz
+from jaxhom.interop.text_files import without_gz
 from jaxhom.models.inputs import check_coordinates
 from jaxhom.models.mdp import MDP
 

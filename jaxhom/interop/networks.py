@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries
-from jaxhom.interop.numbering import whole_of
-from jaxhom.interop.text_files import errors_of, open_text, without_gz
+from jaxhom.interop.numbering import real_of, whole_of
+from jaxhom.interop.text_files import open_text, without_gz
 from jaxhom.interop.text_tables import TextTable, numbered
 
 if TYPE_CHECKING:
@@ -254,12 +254,9 @@ def _places(nodes: Sequence[Hashable], data: Sequence[dict]) -> np.ndarray | Non
 def _number(value: Any, name: str) -> float:
     """A finite number, perhaps as text: GraphML files have texts."""
     try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not np.isfinite(number):
-        raise ValueError(f"{name} must be a number, got {checks.in_one_line(value)}")
-    return number
+        return real_of(value)
+    except ValueError:
+        raise ValueError(f"{name} must be a number, got {checks.in_one_line(value)}") from None
 
 
 def _read_by_networkx(path: str | os.PathLike, directed: bool) -> Any:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import functools
+import math
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
@@ -234,6 +235,21 @@ def whole_of(text: str | int) -> int:
     if "_" in str(text):
         raise ValueError(f"not a whole number: {text!r}")
     return int(text)
+
+
+def real_of(value: object) -> float:
+    """The finite number that a text, or whatever has a float, is; underscores are no digits there either.
+
+    Raises:
+      ValueError: if it is none.
+    """
+    try:
+        number = math.nan if "_" in str(value) else float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"not a number: {value!r}")
+    return number
 
 
 def indices_by_cell(cells: Sequence[str], index: Callable[[str], int]) -> np.ndarray:

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxhom.domains.tile_map import TileMap
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries
-from jaxhom.interop.text_files import errors_of, open_text, require_letters
+from jaxhom.interop.text_files import open_text, require_letters
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Float

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
-from jaxhom.interop.text_files import errors_of, open_text, without_gz
+from jaxhom.interop.numbering import whole_of
+from jaxhom.interop.text_files import open_text, without_gz
 from jaxhom.interop.text_tables import TextTable, numbered
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ def _state_names(base: str, num_states: int, remarks: list[str]) -> list[Hashabl
 def _value(text: str) -> Hashable:
     text = text.strip()
     try:
-        return _WORDS[text] if text in _WORDS else int(text)
+        return _WORDS[text] if text in _WORDS else whole_of(text)
     except ValueError:
         return text
 

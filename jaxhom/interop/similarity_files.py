@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 
-from jaxhom.interop.archives import FileError, read_archive, write_archive
+from jaxhom.interop.archives import errors_of, read_archive, write_archive
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.table import SimilarityTable
@@ -59,9 +59,5 @@ def load_similarity(path: str | os.PathLike, mdp: MDP, *, across_processes: bool
     Example: see `save_similarity`.
     """
     model = as_model(mdp)
-    try:
+    with errors_of(path):
         return SimilarityTable.restored(model, read_archive(path), across_processes=across_processes)
-    except FileError:
-        raise
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from None

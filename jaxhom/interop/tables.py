@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError
+from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
 from jaxhom.interop.numbering import whole_number, whole_of
-from jaxhom.interop.text_files import errors_of
 from jaxhom.interop.text_tables import TextTable
 
 if TYPE_CHECKING:

@@ -56,17 +56,6 @@ def open_text(path: str | os.PathLike, *, newline: str | None = None) -> Iterato
         raise FileError(f"{path}: {error.strerror or error}") from None
 
 
-@contextlib.contextmanager
-def errors_of(path: str | os.PathLike) -> Iterator[None]:
-    """Within it whatever is wrong with a file's contents, a `ValueError`, becomes a `FileError` that names the file."""
-    try:
-        yield
-    except FileError:
-        raise
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from None
-
-
 def require_letters(path: str | os.PathLike, line: int, text: str, letters: Mapping[str, object]) -> None:
     """Raises unless one line of a map is made of the letters."""
     for column, letter in enumerate(text, start=1):

@@ -103,6 +103,8 @@ class TextTable:
     def _numbers(self, place: int, name: str, kind: type[int] | type[float], what: str) -> np.ndarray:
         texts = self.columns[place] if self.columns else []
         try:
+            if any("_" in text for text in texts):  # which Python takes for nothing
+                raise ValueError
             return np.array([kind(text) for text in texts], np.dtype(kind))
         except (ValueError, OverflowError):  # whole numbers of more than 64 bits are the latter
             row = next(row for row, text in enumerate(texts) if not _is(kind, text))
@@ -163,6 +165,6 @@ def _quoted(path: str | os.PathLike, text: str, separator: str, comments: str) -
 def _is(kind: type[int] | type[float], text: str) -> bool:
     try:
         number = kind(text)
-        return kind is float or -(2**63) <= number < 2**63
+        return "_" not in text and (kind is float or -(2**63) <= number < 2**63)
     except ValueError:
         return False

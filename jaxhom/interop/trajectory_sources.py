@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError, names_of_arrays
+from jaxhom.interop.archives import FileError, errors_of, names_of_arrays
 from jaxhom.interop.column_names import KNOWN, fields_by_role, find_columns, is_keyed, listed, plain
 from jaxhom.interop.csv_steps import demonstrations_from_csv
 from jaxhom.interop.files import DEMONSTRATIONS, load_arrays, load_demonstrations
@@ -86,16 +86,13 @@ def demonstrations_from(
     options = {"mdp": mdp, "columns": columns, "to_states": to_states, "ambiguous": ambiguous}
     if not isinstance(source, str | os.PathLike):
         return _from_object(source, options)
-    try:
-        return _from_path(pathlib.Path(source), options)
-    except FileError:
-        raise
-    except FileNotFoundError:
-        raise FileError(f"{source}: no such file") from None
-    except OSError as error:
-        raise FileError(f"{source}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise FileError(f"{source}: {error}") from None
+    with errors_of(source):
+        try:
+            return _from_path(pathlib.Path(source), options)
+        except FileNotFoundError:
+            raise FileError(f"{source}: no such file") from None
+        except OSError as error:
+            raise FileError(f"{source}: {error.strerror or error}") from None
 
 
 def _from_object(source: Any, options: dict[str, Any]) -> tuple[Demonstrations, ImportReport]:

@@ -24,7 +24,7 @@ from jaxhom.models.inputs import as_model, check_policy
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.models.names import described
 from jaxhom.models.sampling import sample_walks
-from jaxhom.models.trajectories import padded, require_flags, with_single_steps
+from jaxhom.models.trajectories import padded, with_single_steps
 from jaxhom.programs import quick_jit
 from jaxhom.status import Record
 
@@ -79,8 +79,9 @@ class Demonstrations(Record):
         Args:
           trajectories: M pairs of non-empty sequences with as many states as actions, or one more: the last is then the
             state in which the episode ended, where no action was taken. Lengths may differ between pairs.
-            Demonstrations are such pairs too, and keep what else is known of them.
-          terminated: bool [M], which episodes ended by themselves; the others were cut off. False for all if None.
+            Demonstrations are taken as they are, hidden steps and all.
+          terminated: bool [M], which episodes ended by themselves; the others were cut off. False for all if None, or
+            what demonstrations say themselves.
 
         Raises:
           ValueError: if there is no trajectory, one is empty or not a pair, its lengths do not fit, an entry is
@@ -92,13 +93,14 @@ class Demonstrations(Record):
           >>> demonstrations.states.tolist(), demonstrations.final_states.tolist()
           ([[0, 1], [0, 0]], [2, 3])
         """
-        given = trajectories if isinstance(trajectories, cls) else None
-        if given is not None and terminated is None:
-            terminated = given.terminated
-        arrays = padded(trajectories, terminated)
-        if given is not None:
-            arrays["is_answer"] = np.asarray(given.is_answer)
-        return cls(**{name: checks.to_device(array) for name, array in arrays.items()})
+        if not isinstance(trajectories, cls):
+            arrays = padded(trajectories, terminated)
+            return cls(**{name: checks.to_device(array) for name, array in arrays.items()})
+        if terminated is None:
+            return trajectories
+        terminated = checks.as_host_array("terminated", terminated)
+        terminated = checks.require_flags("terminated", terminated, len(trajectories))
+        return trajectories.replace(terminated=checks.to_device(terminated))
 
     @checks.eager_where_concrete
     def with_answers(self, states: Int[ArrayLike, " N"], actions: Int[ArrayLike, " N"]) -> Demonstrations:
@@ -378,7 +380,7 @@ def sample_demonstrations(
     num_trajectories = checks.require_count("num_trajectories", num_trajectories)
     horizon = checks.require_count("horizon", horizon)
     if terminal is not None:
-        terminal = require_flags("terminal", jnp.asarray(terminal), mdp.num_states)
+        terminal = checks.require_flags("terminal", jnp.asarray(terminal), mdp.num_states)
         if not checks.is_traced(terminal, mdp.initial):
             starts = np.asarray(mdp.initial) > 0
             message = "must be False where episodes start: one that starts there has no step"

@@ -113,22 +113,23 @@ def padded(explored: Explored) -> tuple[np.ndarray, np.ndarray]:
 def features_of(features: Callable[[Any, Any], Sequence[float]], explored: Explored) -> np.ndarray:
     """float [S, A, K]: the features of all pairs that exist; 0 elsewhere, and so in states without actions.
 
+    Where no state has an action, nobody can say how many features there are: K = 0.
+
     Raises:
       ValueError: naming state and action of the first pair whose features are no K numbers.
     """
-    rows, table = np.unique(explored.pair), None
+    rows, table = np.unique(explored.pair), np.zeros((len(explored.states), len(explored.actions), 0))
     for pair in rows.tolist():
         state, action = divmod(pair, len(explored.actions))
         names = explored.states[state], explored.actions[action]
         row = checks.as_host_array(f"features of {_where(*names)}", _call("features", features, *names))
-        if table is None:
-            table = np.zeros((len(explored.states), len(explored.actions), row.size))
+        if pair == rows[0]:
+            table = np.zeros((*table.shape[:2], row.size))
         good = row.shape == table.shape[2:] and row.dtype.kind in "iubf" and np.isfinite(row).all()
         if not good:
             expected = f"{table.shape[2]} finite numbers, as those of the first pair"
             raise ValueError(f"features of {_where(*names)} must be {expected}, got {checks.in_one_line(row.tolist())}")
         table[state, action] = row
-    assert table is not None  # there is an action
     return table
 
 

@@ -275,15 +275,20 @@ class MDP(Record):
 
     def _without_actions(self, allowed) -> MDP:
         """The model with fewer actions."""
-        allowed = construction.check_allowed(allowed, self.allowed.shape)
-        checks.require_all("allowed", allowed, ~allowed | np.asarray(self.allowed), "is a pair without transitions")
-        keep = checks.to_device(allowed)[..., None]
+        if checks.is_traced(allowed, self):
+            good = jnp.shape(allowed) == self.allowed.shape
+            checks.require_shape("allowed", allowed, str(self.allowed.shape), good)
+            keep, restricts_actions = jnp.asarray(allowed, bool) & self.allowed, True
+        else:
+            allowed = construction.check_allowed(allowed, self.allowed.shape)
+            checks.require_all("allowed", allowed, ~allowed | np.asarray(self.allowed), "is a pair without transitions")
+            keep, restricts_actions = checks.to_device(allowed), not allowed.all()
         return self._exchange(
             {
-                "allowed": checks.to_device(allowed),
-                "probability": jnp.where(keep, self.probability, 0.0),
-                "features": jnp.where(keep, self.features, 0.0),
-                "restricts_actions": not allowed.all(),
+                "allowed": keep,
+                "probability": jnp.where(keep[..., None], self.probability, 0.0),
+                "features": jnp.where(keep[..., None], self.features, 0.0),
+                "restricts_actions": restricts_actions,
             }
         )
 
@@ -398,7 +403,10 @@ def _replacement(mdp: MDP, name: str, new) -> jax.Array | Names | None:
             new = jnp.broadcast_to(jnp.asarray(new)[:, None], (*old.shape[:2], jnp.shape(new)[1]))
         good = jnp.shape(new) == old.shape or (name == "features" and jnp.shape(new)[:-1] == old.shape[:-1])
         checks.require_shape(name, new, str(old.shape), good)
-        return jnp.asarray(new, old.dtype)
+        new = jnp.asarray(new, old.dtype)
+        if mdp.restricts_actions and name in ("features", "probability"):
+            new = jnp.where(mdp.allowed[..., None], new, 0.0)
+        return new
     if name == "discount":
         new = checks.require_discount(new, old.dtype)
         construction.check_contraction(mdp.probability, new)

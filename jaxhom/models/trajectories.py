@@ -33,7 +33,7 @@ def padded(trajectories: Iterable[Any], terminated: Bool[ArrayLike, " M"] | None
     require_no_steps(list(enumerate(trajectories)), "trajectory")
     if terminated is None:
         terminated = np.zeros(len(rows), bool)
-    terminated = require_flags("terminated", checks.as_host_array("terminated", terminated), len(rows))
+    terminated = checks.require_flags("terminated", checks.as_host_array("terminated", terminated), len(rows))
     horizon = max(len(actions) for _, actions in rows)
     require_slots(len(rows), horizon)
     return {**_in_rows(rows, horizon), "terminated": terminated}
@@ -112,14 +112,6 @@ def _may_be_steps(pair: Any) -> bool:
     if len(parts) < 2 or any(hasattr(entry, "__len__") for part in parts for entry in part):
         return False
     return not isinstance(pair, tuple) or all(isinstance(part, tuple) for part in parts)
-
-
-def require_flags(name: str, array: Any, count: int) -> Any:
-    """Returns `array` if it is bool [count], or raises."""
-    checks.require_shape(name, array, f"({count},)", array.shape == (count,))
-    if array.dtype != bool:
-        raise ValueError(f"{name} must be bool, got dtype {array.dtype}")
-    return array
 
 
 def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:

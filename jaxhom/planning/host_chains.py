@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import functools
 import weakref
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _NARROW = 8.0  # bandwidth, in square roots of S, up to which elimination fills in little: roads, grids, corridors
 _FEW_ENTRIES = 1e5  # states times bandwidth that any factor may hold: 300 states, all linked, take 2 ms
+_BAND_WORK = 8e6  # states times squared bandwidth, up to which a band is factorised sooner: grids up to 48 x 48
 _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
 # Up to these a solve on the host takes less time than a program's compiling, half a second; above such a discount less
 # than the hundreds of products of an iteration.
@@ -54,6 +55,33 @@ def host_model(mdp: MDP) -> HostModel:
     return model
 
 
+class _Order(NamedTuple):
+    """Where each state stands [S], and how far apart linked states stand then."""
+
+    place: Int[np.ndarray, " S"]
+    bandwidth: int
+
+
+class _BandFactor:
+    """LU of a matrix whose entries lie in a band once its rows and columns stand in an order (LAPACK's `gbtrf`)."""
+
+    def __init__(self, numbers: np.ndarray, row: np.ndarray, column: np.ndarray, order: _Order) -> None:
+        self._place, width = order
+        self._width, size, height = width, len(order.place), 3 * width + 1
+        row, column = order.place[row], order.place[column]
+        band = np.bincount(column * height + (2 * width + row - column), numbers, size * height)
+        band = band.reshape((height, size), order="F")
+        self._band, self._pivots, _ = scipy.linalg.lapack.dgbtrf(band, width, width, overwrite_ab=True)
+
+    def solve(self, right: np.ndarray, kind: str) -> np.ndarray:
+        """Solves with the matrix ("N") or its transpose ("T"), as those of SuperLU do."""
+        ordered = np.empty(right.shape)
+        ordered[self._place] = right
+        factor = (self._band, self._width, self._width)
+        solution, _ = scipy.linalg.lapack.dgbtrs(*factor, ordered, self._pivots, trans=int(kind == "T"))
+        return solution.reshape(right.shape)[self._place]
+
+
 class HostModel:
     """A concrete model in NumPy and SciPy, float64.
 
@@ -75,7 +103,7 @@ class HostModel:
     def with_rows(self, rows: Float[np.ndarray, "S*A S"] | scipy.sparse.csr_array) -> HostModel:
         """The model with other transitions, as `rows` has them; what is not allowed any more stays with the caller."""
         other = copy.copy(self)
-        other.__dict__.pop("bandwidth", None)
+        other.__dict__.pop("_order", None)
         other.rows = rows
         return other
 
@@ -97,7 +125,8 @@ class HostModel:
         """
         by_products = may_iterate and not self.is_soon_factorised
         may_factorise &= self.is_solvable or not by_products  # who does not want products has asked before
-        return HostChain(self._transition(policy), self.discount, by_products, may_factorise)
+        order = self._order if self.is_band and not by_products else None
+        return HostChain(self._transition(policy), self.discount, by_products, may_factorise, order)
 
     def _transition(self, policy) -> np.ndarray | scipy.sparse.csr_array:
         states = np.arange(self.num_states)
@@ -111,18 +140,26 @@ class HostModel:
         choice = scipy.sparse.csr_array(entries, shape=(self.num_states, len(states) * self.num_actions))
         return choice @ self.rows
 
-    @functools.cached_property
+    @property
     def bandwidth(self) -> int:
         """How far apart linked states are in a good order of the states: what elimination fills in."""
-        if not scipy.sparse.issparse(self.rows):
-            return self.num_states
+        return self._order.bandwidth if scipy.sparse.issparse(self.rows) else self.num_states
+
+    @property
+    def is_band(self) -> bool:
+        """Whether all that a band holds is worked off before sparse LU has found where to begin."""
+        return scipy.sparse.issparse(self.rows) and self.num_states * self.bandwidth**2 <= _BAND_WORK
+
+    @functools.cached_property
+    def _order(self) -> _Order:
+        """A good order of the states of a sparse model."""
         owner = np.repeat(np.arange(len(self.rows.indptr) - 1) // self.num_actions, np.diff(self.rows.indptr))
         ones = np.ones(len(owner), np.float32)
         links = scipy.sparse.coo_array((ones, (owner, self.rows.indices)), shape=(self.num_states,) * 2).tocsr()
         order = scipy.sparse.csgraph.reverse_cuthill_mckee(links, symmetric_mode=False)
         place = np.empty(self.num_states, np.int64)
         place[order] = np.arange(self.num_states)
-        return int(np.abs(place[owner] - place[self.rows.indices]).max(initial=0))
+        return _Order(place, int(np.abs(place[owner] - place[self.rows.indices]).max(initial=0)))
 
     @property
     def is_narrow(self) -> bool:
@@ -177,7 +214,8 @@ class HostModel:
 class HostChain:
     """One chain P_pi: solves with I - gamma P_pi and with its transpose.
 
-    By LU; with `by_products` by BiCGSTAB (van der Vorst 1992), and by LU where that does not get on and may be.
+    By LU, of a band if `order` makes one of the states; with `by_products` by BiCGSTAB (van der Vorst 1992),
+    and by LU where that does not get on and may be.
     """
 
     def __init__(
@@ -186,8 +224,10 @@ class HostChain:
         discount: float,
         by_products: bool = False,
         may_factorise: bool = True,
+        order: _Order | None = None,
     ) -> None:
         self._discount, self._by_products, self._may_factorise = discount, by_products, may_factorise
+        self._order = order
         if not scipy.sparse.issparse(transition):
             self._transition = transition / _or_one(transition.sum(axis=1))[:, None]
             return
@@ -198,7 +238,7 @@ class HostChain:
 
     @functools.cached_property
     def _factor(self):
-        """Of I - gamma P; of its transpose if it is sparse."""
+        """Of I - gamma P; of its transpose if it is sparse: its diagonal dominates its columns, so nothing pivots."""
         transition, discount = self._transition, self._discount
         if not scipy.sparse.issparse(transition):
             leaving = transition - np.diag(transition.diagonal())
@@ -211,7 +251,8 @@ class HostChain:
         keeps = (1.0 - discount) + discount * np.bincount(state[leaves], chance[leaves], size)
         numbers = np.concatenate([-discount * chance[leaves], keeps])
         row, column = np.append(state[leaves], states), np.append(successor[leaves], states)
-        # The transpose, by columns as SuperLU wants it. No pivoting: the diagonal dominates.
+        if self._order is not None:
+            return _BandFactor(numbers, column, row, self._order)
         columns = scipy.sparse.csc_array((numbers, (column, row)), shape=transition.shape)
         return scipy.sparse.linalg.splu(
             columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}

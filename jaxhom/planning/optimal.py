@@ -70,7 +70,8 @@ def optimal_policy(
       rounding within which actions count as tied.
 
     Raises:
-      ValueError: if a shape does not fit, a concrete reward is NaN or +inf, or forbids every action of a state.
+      ValueError: if a shape does not fit, a concrete reward is NaN or +inf, or forbids every action of a state; if
+        `initial_value` is not finite, or a tolerance negative.
 
     Example:
       >>> from jaxhom import MDP
@@ -84,19 +85,17 @@ def optimal_policy(
     mdp = as_model(mdp)
     reward, is_batch = reward_batch(mdp, reward)
     xp = checks.arrays_of(mdp, reward, initial_value, tolerance)
-    initial_value = xp.asarray(np.zeros(mdp.num_states) if initial_value is None else initial_value, mdp.dtype)
-    if initial_value.shape == (mdp.num_states,):
-        initial_value = xp.broadcast_to(initial_value, (reward.shape[0], mdp.num_states))
-    good = initial_value.shape == (reward.shape[0], mdp.num_states)
-    checks.require_shape("initial_value", initial_value, f"(..., {mdp.num_states})", good)
+    value = first_values(xp, mdp, initial_value, len(reward))
     max_iterations = checks.require_count("max_iterations", max_iterations, least=0)
     is_default = tolerance is None
     if not is_default:
         checks.require_positive("tolerance", tolerance, or_zero=True)
     else:
         tolerance = (1e-10 if mdp.dtype == jnp.float64 else 1e-5) * _scale(xp, reward)
-    tolerance = xp.broadcast_to(xp.asarray(tolerance, mdp.dtype), reward.shape[:1])
-    inputs = (mdp, xp.moveaxis(reward, 0, -1), initial_value.T, tolerance)
+    lanes = reward.shape[:1]
+    checks.require_shape("tolerance", tolerance, f"() or {lanes}", np.shape(tolerance) in ((), lanes))
+    tolerance = xp.broadcast_to(xp.asarray(tolerance, mdp.dtype), lanes)
+    inputs = (mdp, xp.moveaxis(reward, 0, -1), value.T, tolerance)
     if xp is np:
         with progress_of_sweeps(progress) as report:
             options = {"max_iterations": max_iterations, "is_polished": is_default, "report": report}
@@ -139,6 +138,19 @@ def reward_batch(mdp: MDP, reward) -> tuple[Float[Array, "B S A"], bool]:
             where = f"[{lane}, {state}]" if is_batch else f"[{state}]"
             raise ValueError(f"reward{where} is -inf for every action: a state needs one that is allowed")
     return reward, is_batch
+
+
+def first_values(xp: ModuleType, mdp: MDP, initial_value, lanes: int) -> Float[Array, "B S"]:
+    """Brings the accepted shapes of `initial_value` to [B, S]; checks the values; zero if None."""
+    if initial_value is None:
+        initial_value = np.zeros(mdp.num_states)
+    elif not checks.is_traced(initial_value):
+        host = checks.as_host_array("initial_value", initial_value)
+        initial_value = checks.require_floats_in(mdp.dtype, "initial_value", host)
+    shape = (lanes, mdp.num_states)
+    good = initial_value.shape in (shape, shape[1:])
+    checks.require_shape("initial_value", initial_value, f"{shape[1:]} or {shape}", good)
+    return xp.broadcast_to(xp.asarray(initial_value, mdp.dtype), shape)
 
 
 def _scale(xp: ModuleType, reward: Float[Array, "B S A"]) -> Float[Array, " B"]:

@@ -18,10 +18,14 @@ import scipy
 from jaxhom.planning.host_chains import HostModel
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jaxtyping import Float, Int
 
 _MAX_IMPROVEMENTS = 1000  # never needed: it ends a loop that rounding might keep going
-_SWEEPS = 100  # between two solves, at most: as long as they change the policy
+# Between two solves, at most: of models whose factors take no longer than these (grids from 24 x 24 to 48 x 48, at
+# discounts from 0.9 to 0.999), and of others.
+_FEW_SWEEPS, _SWEEPS = 10, 100
 _ROUNDINGS = 16.0  # of the model's type, in rewards and differences of values: a backup adds a few of each up
 _ROUNDINGS_OF_VALUES = 64.0  # of float64, in the values themselves, which come from a factorisation
 
@@ -64,26 +68,50 @@ def iterate(
     Returns:
       `HostPlan`; None if the first policy's values cannot be computed.
     """
+
+    def backup(value):
+        return reward + model.discount * model.expected_next_value(value)
+
     states, best = np.arange(len(actions)), None
     for count in range(1, limit + 1):
         value = model.chain(actions).value(reward[states, actions])
         # Exact values never fall from policy to policy: if they do, rounding has won.
         if not np.isfinite(value).all() or (best is not None and value.sum() < best[1].sum()):
             break
-        action_value = reward + model.discount * model.expected_next_value(value)
+        action_value = backup(value)
         best = (actions, value, action_value, count)
         improved = _improve(actions, action_value)
         if improved is actions:
             return _finish(model, reward, best, eps, is_settled=True)
-        # Sweeps cost little beside a factorisation, and carry news from state to state: values only rise on the way.
-        for _ in range(_SWEEPS):
-            actions = improved
-            action_value = reward + model.discount * model.expected_next_value(action_value[states, actions])
-            improved = _improve(actions, action_value)
-            if improved is actions:
-                break
-        actions = improved
+        actions = swept(model, backup, improved, value)
     return None if best is None else _finish(model, reward, best, eps, is_settled=False)
+
+
+def swept(
+    model: HostModel,
+    backup: Callable[[np.ndarray], np.ndarray],
+    actions: Int[np.ndarray, " S"],
+    value: Float[np.ndarray, " S"],
+) -> Int[np.ndarray, " S"]:
+    """Better actions by sweeps, as long as these change the policy.
+
+    They cost little beside a factorisation, and carry news from state to state: on a grid of 24 x 24 at a discount of
+    0.99 policy iteration ends after 6 of them instead of 11.
+
+    Args:
+      model: the model.
+      backup: takes values [S], returns action values [S, A].
+      actions: those that are best by the values [S], which are not above what the actions are worth.
+    """
+    states = np.arange(len(actions))
+    value = backup(value)[states, actions]
+    for _ in range(_FEW_SWEEPS if model.is_band else _SWEEPS):
+        action_value = backup(value)
+        improved = _improve(actions, action_value)
+        if improved is actions:
+            break
+        actions, value = improved, action_value[states, improved]
+    return actions
 
 
 def _improve(actions: np.ndarray, action_value: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from jaxhom.models.mdp import MDP, expected_next_value
 from jaxhom.planning.chain_solver import solve_chain
 from jaxhom.planning.host_chains import HostChain, HostModel, host_model
 from jaxhom.planning.occupancy import policy_value
-from jaxhom.planning.optimal import empty_plan, reward_batch
+from jaxhom.planning.optimal import empty_plan, first_values, reward_batch
 from jaxhom.planning.plan import Plan
 from jaxhom.planning.plan_program import hidden_share
 from jaxhom.status import Status
@@ -73,7 +73,7 @@ def soft_optimal_policy(
       optimum; a soft value is the best reward plus tau times the entropies, so not a bound on rewards alone.
 
     Raises:
-      ValueError: as `optimal_policy`; if `temperature` is not positive.
+      ValueError: as `optimal_policy`; if `temperature` or `tolerance` is not one positive number.
 
     Example:
       >>> from jaxhom import MDP
@@ -90,18 +90,12 @@ def soft_optimal_policy(
     if not checks.is_traced(temperature):
         temperature = checks.require_number("temperature", temperature)
     xp = checks.arrays_of(mdp, reward, initial_value, temperature)
-    if initial_value is None:
-        initial_value = np.zeros(mdp.num_states)
-    elif not checks.is_traced(initial_value):
-        initial_value = checks.require_floats("initial_value", checks.as_host_array("initial_value", initial_value))
-    lanes = (reward.shape[0], mdp.num_states)
-    good = initial_value.shape in (lanes[1:], lanes)
-    checks.require_shape("initial_value", initial_value, f"{lanes[1:]} or {lanes}", good)
-    value = xp.broadcast_to(xp.asarray(initial_value, mdp.dtype), lanes)
+    value = first_values(xp, mdp, initial_value, len(reward))
     max_iterations = checks.require_count("max_iterations", max_iterations)
     share = _LEAST_DIGITS.get(np.dtype(mdp.dtype), 1e-5)
     if tolerance is not None:
         checks.refuse_traced(tolerance=tolerance)
+        tolerance = checks.require_number("tolerance", tolerance)
         checks.require_positive("tolerance", tolerance)
     goal = _Goal(tolerance, share, max_iterations)
     if xp is np:

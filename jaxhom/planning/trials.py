@@ -313,10 +313,12 @@ def _validated(mdp: MDP, policy, reward, terminal, events):
     reward = checks.to_device(check_reward(mdp, reward, policy.shape))
     pair = (mdp.num_states, mdp.num_actions)
     terminal = jnp.zeros(pair[:1], bool) if terminal is None else checks.to_device(terminal)
-    checks.require_shape("terminal", terminal, str(pair[:1]), terminal.shape == pair[:1])
-    if terminal.dtype != bool:
-        raise ValueError(f"terminal must be bool, got dtype {terminal.dtype}")
-    events = {name: checks.to_device(event, mdp.dtype) for name, event in (events or {}).items()}
-    for name, event in events.items():
-        checks.require_shape(f"events[{name!r}]", event, str(pair), event.shape == pair)
-    return check_policy(mdp, policy), reward, terminal, events
+    checks.require_flags("terminal", terminal, mdp.num_states)
+    checked = {}
+    for name, event in (events or {}).items():
+        described = f"events[{name!r}]"
+        if not checks.is_traced(event):
+            event = checks.require_floats(described, checks.as_host_array(described, event))
+        checks.require_shape(described, event, str(pair), event.shape == pair)
+        checked[name] = checks.to_device(event, mdp.dtype)
+    return check_policy(mdp, policy), reward, terminal, checked

@@ -61,6 +61,7 @@ def test_models_without_a_map(name, end_state):
         ([], [(0, 1), (0, 0)], "rows must be equally long"),
         (["..x"], [(0, 1), (0, 0)], r"rows\[0\] must be made of #, ., S, F and @, got '..x'"),
         (["..."], [(0, 1)], r"moves must have shape \(2, 2\)"),
+        (["..."], [(0, 1), (0, 0.5)], r"moves\[1, 1\] must be whole, got 0\.5"),
     ],
 )
 def test_malformed_maps_are_rejected(rows, moves, message):
@@ -71,6 +72,11 @@ def test_malformed_maps_are_rejected(rows, moves, message):
 def test_cells_off_the_map_are_rejected():
     with pytest.raises(ValueError, match=r"cell \(1, 0\) is outside the 1 x 3 map"):
         TileMap.from_rows(corridor(), ["..."], [(0, 1), (0, 0)]).state_of((1, 0))
+
+
+def test_cells_that_are_not_whole_are_rejected():
+    with pytest.raises(ValueError, match=r"cell must be two whole numbers \(row, column\), got \(0, 0\.5\)"):
+        TileMap.from_rows(corridor(), ["..."], [(0, 1), (0, 0)]).state_of((0, 0.5))
 
 
 def test_cells_that_are_no_states():

@@ -260,6 +260,7 @@ BAD = {
     "observation": (HEAD + "T: * uniform\nR: * : * : * : z 1\n", "line 7 (R): no observation 'z' among 'x, y'"),
     "too many fields": (HEAD + "T: go : a : a : x 1\n", "line 6 (T): 4 fields, but the table has 3"),
     "number": (HEAD + "T: go : a : a one\n", "line 6 (T): expected a number, got 'one'"),
+    "underscore": (HEAD + "T: go : a : a 0_1\n", "line 6 (T): expected a number, got '0_1'"),
     "number among many": (HEAD + "T: go : a : a 1\nT: go : b : b nan\n", "line 7 (T): expected a number, got 'nan'"),
     "number missing": (HEAD + "T: go : a : a\nT: go : a : b 1\n", "line 6 (T): expected 1 number, got 0"),
     "two numbers": (HEAD + "T: go : a : a 0.5 0.5\n", "line 6 (T): expected 1 number, got 2: '0.5 0.5'"),

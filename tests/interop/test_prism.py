@@ -123,6 +123,8 @@ BAD = {
     "word": ({"tra": TRA.replace("1 0 3", "one 0 3")}, "m.tra line 5: state must be a whole number, got 'one'"),
     "huge": ({"tra": TRA.replace("1 0 3", f"{10**30} 0 3")}, "m.tra line 5: state must be a whole number, got '10000"),
     "number": ({"tra": TRA.replace("0.25", "x")}, "m.tra line 6: probability must be a number, got 'x'"),
+    "underscore": ({"tra": TRA.replace("0.25", "0.2_5")}, "m.tra line 6: probability must be a number, got '0.2_5'"),
+    "underscores of a state": ({"tra": TRA.replace("1 0 3", "1 0 0_3")}, "m.tra line 5: next state must be a whole"),
     "infinite": ({"tra": TRA.replace("0.25", "inf")}, "m.tra line 6: probability must be finite, got 'inf'"),
     "sum": (
         {"tra": TRA.replace("0.25", "0.5")},

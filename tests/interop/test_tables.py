@@ -139,6 +139,7 @@ BAD = {
     HEAD: "it has no rows",
     HEAD + "0,0,0,1\n": "line 2: expected 5 fields, as many as the first line has, got '0 0 0 1'",
     HEAD + "0,0,0,1,2\n\n0,1,0,1,2,3\n": "line 4: expected 5 fields",
+    HEAD + "0,0,0,0_1,2\n": "line 2: column 'probability' must be a number, got '0_1'",
     HEAD + "0,0,0,one,2\n": "line 2: column 'probability' must be a number, got 'one'",
     HEAD + "0,0,0,1,2\n0,1,0,1,nan\n": "line 3: column 'reward' must be finite, got 'nan'",
     HEAD + "0,0,0,1,2\n,1,0,1,2\n": "line 3: column 'state' is empty",

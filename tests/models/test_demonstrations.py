@@ -171,6 +171,17 @@ def test_they_are_a_sequence_of_trajectories():
         demonstrations[3]
 
 
+def test_hidden_steps_of_demonstrations_stay_where_they_are():
+    demonstrations = Demonstrations.from_trajectories(RAGGED)
+    hidden = demonstrations.replace(mask=demonstrations.mask.at[2, 1].set(False))
+    chex.assert_trees_all_equal(Demonstrations.from_trajectories(hidden), hidden)
+    ended = np.array([False, True, True])
+    found = Demonstrations.from_trajectories(hidden, ended)
+    chex.assert_trees_all_equal(found, hidden.replace(terminated=jnp.asarray(ended)))
+    with pytest.raises(ValueError, match="terminated must have shape"):
+        Demonstrations.from_trajectories(hidden, [True])
+
+
 def test_they_are_a_pytree_and_can_be_pickled():
     """However they were made: without their ends, nobody is known to have terminated."""
     full = Demonstrations.from_trajectories(RAGGED)

@@ -114,6 +114,13 @@ def test_the_number_of_features_may_not_change():
         MDP.from_function(lambda s: {"a": [(1.0, 1)]}, 0, discount=0.9, features=lambda s, a: [0.0] * (s + 1))
 
 
+def test_where_every_state_ends_there_are_no_features():
+    """Nobody can be asked how many there are."""
+    mdp = MDP.from_function(lambda s: None, "x", discount=0.9, actions=["a", "b"], features=lambda s, a: [1.0])
+    assert (mdp.num_states, mdp.num_actions, mdp.num_features) == (1, 2, 0)
+    np.testing.assert_array_equal(mdp.transition, 1)
+
+
 def test_errors_of_the_function_say_where():
     with pytest.raises(ZeroDivisionError) as caught:
         MDP.from_function(lambda s: {"a": [(1 / (2 - s), s + 1)]}, 1, discount=0.9)

@@ -430,6 +430,30 @@ def test_features_of_states_are_zero_where_an_action_does_not_exist():
     np.testing.assert_array_equal(np.asarray(mdp.features), np.broadcast_to(allowed[..., None], (2, 2, 3)))
 
 
+@pytest.mark.parametrize("name", ["features", "probability"])
+def test_what_is_replaced_under_jit_is_zero_where_an_action_does_not_exist(name):
+    """As it is at hand: what stands there may be anything."""
+    allowed = np.array([[True, False], [True, True]])
+    mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.9, features=np.ones((2, 3)), allowed=allowed)
+    new = np.where(allowed[..., None], getattr(mdp, name), np.nan)
+    replaced = jax.jit(lambda mdp, new: mdp.replace(**{name: new}))(mdp, new)
+    chex.assert_trees_all_equal(replaced, mdp)
+
+
+@pytest.mark.parametrize("is_model_traced", [True, False])
+def test_actions_are_taken_away_under_jit(is_model_traced):
+    mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.9, features=np.ones((2, 3)))
+    allowed = np.array([[True, False], [True, True]])
+    expected = mdp.replace(allowed=allowed)
+    if is_model_traced:
+        found = jax.jit(lambda mdp: mdp.replace(allowed=allowed))(mdp)
+    else:
+        found = jax.jit(lambda allowed: mdp.replace(allowed=allowed))(allowed)
+    chex.assert_trees_all_equal(found, expected)
+    with pytest.raises(ValueError, match="allowed must have shape"):
+        jax.jit(lambda mdp: mdp.replace(allowed=allowed[:1]))(mdp)
+
+
 def test_models_are_short_when_printed():
     text = repr(gridworld(5, num_regions=25).mdp)
     start = "MDP(num_states=25, num_actions=4, num_features=25, discount=0.99, dtype='float64', "

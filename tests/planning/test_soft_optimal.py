@@ -189,6 +189,7 @@ def test_second_derivatives():
         ({"temperature": [1.0, 2.0]}, "temperature must be a number"),
         ({"temperature": np.nan}, "temperature must be finite"),
         ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"tolerance": [0.1, 0.1]}, "tolerance must be a number"),
         ({"max_iterations": 0}, "max_iterations must be at least 1"),
         ({"initial_value": np.zeros(3)}, "initial_value must have shape"),
         ({"initial_value": np.full(7, np.inf)}, r"initial_value\[0\] must be finite"),

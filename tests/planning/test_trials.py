@@ -336,6 +336,10 @@ MALFORMED = {
     "terminal of another size": ({"terminal": np.ones(S + 1, bool)}, "terminal must have shape"),
     "terminal as indices": ({"terminal": np.arange(S)}, "terminal must be bool"),
     "event of states": ({"events": {"bump": np.ones(S)}}, r"events\['bump'\] must have shape"),
+    "event that is no number": (
+        {"events": {"bump": np.full((S, A), np.nan)}},
+        r"events\['bump'\]\[0, 0\] must be finite",
+    ),
     "horizon zero": ({"horizon": 0}, "horizon must be at least 1"),
     "horizon a fraction": ({"horizon": 2.5}, "horizon must be a whole number"),
 }

@@ -54,7 +54,7 @@ _GRID_TRIAL = 50  # steps, as in the paper
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Means over the sets of one method's figures on one domain; `nan` where a figure does not apply."""
+    """One method's figures on one domain: means over the sets, of gaps the largest; `nan` where one does not apply."""
 
     method: str
     reward_per_step: float
@@ -151,9 +151,11 @@ def run(options: argparse.Namespace) -> None:
             drawn.setdefault(type(setting.domain), (setting, policies))
     track_trial = drawn[Racetrack][0].problem.trial
     print(
-        f"\nMeans over {options.sets} sets of demonstrations; exact evaluation in trials of the demonstrations' length"
+        f"\nMeans over {options.sets} sets of demonstrations; exact evaluation in trials of the demonstrations' "
+        "length\n"
+        f"(gridworld {_GRID_TRIAL}) or {track_trial} steps (racetrack). `loss <=` and `LPAL gap`, the largest, are per "
+        "step."
     )
-    print(f"(gridworld {_GRID_TRIAL}) or {track_trial} steps (racetrack). `loss <=` and `LPAL gap` are per step.")
     warn(told)
     if options.picture and len(drawn) == 2:
         _draw(picture_key, options.picture, drawn[Gridworld], drawn[Racetrack])
@@ -248,7 +250,7 @@ def _fed_with_zeros(setting: _Setting) -> _Policies:
 
 
 def _measurer(setting: _Setting) -> Callable[[_Policies], Row]:
-    """What makes the rows of a block: means over the sets of a method's policies and gaps."""
+    """What makes the rows of a block: means over the sets of what a method's policies reach, and its largest gap."""
     problem, mdp = setting.problem, setting.problem.mdp
     best = setting.expert.upper_bound(mdp) @ mdp.initial
     endings = {"terminal": problem.terminal, "events": problem.events}

@@ -8,7 +8,7 @@
     finished    share of trials that are in a terminal state within these steps
     off-roads   per step, on racetracks
 
-The first two, `loss <=` among them, need a reward.
+`value`, `loss <=` and `reward` need a reward.
 """
 
 from __future__ import annotations

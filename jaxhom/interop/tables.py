@@ -53,8 +53,9 @@ def from_table(
       The model, its reward, None if the table has none, and the states without actions as `terminal`.
 
     Raises:
-      FileError: naming the file, and the line and column of what is malformed; and `ValueError`, with the row, if the
-        table is no file. If a column is missing or named twice, or the probabilities of a pair do not sum to 1.
+      FileError: naming the file, and the line and column of what is malformed; if a column is missing or named twice,
+        or the probabilities of a pair do not sum to 1.
+      ValueError: for the same, with the row, if the table is no file.
 
     Outside jit, vmap and grad only: what is read is checked on the host.
 

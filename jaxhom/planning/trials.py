@@ -89,7 +89,8 @@ def evaluate_exactly(
       An `Evaluation` without standard errors, exact up to rounding.
 
     Raises:
-      ValueError: if a shape does not fit, `terminal` is not bool, or `horizon` is below 1.
+      ValueError: if a shape does not fit, `terminal` is not bool, a reward, an event or a policy is not finite, or
+        `horizon` is below 1.
 
     Source: the measures of Boularias and Chaib-draa 2010, section VI.
 

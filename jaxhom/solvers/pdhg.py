@@ -163,6 +163,9 @@ def solve(problem: Problem, state: PDHGState, *, tolerance, max_iterations: int 
       state: from `init` or a former call.
       tolerance: scalar or [lanes], the gap to reach.
       max_iterations: per lane.
+
+    Returns:
+      The state where every lane ended, from which a further call goes on.
     """
     if module_of(state.primal) is np:
         while not is_finished(state, tolerance, np.nan, max_iterations).all():

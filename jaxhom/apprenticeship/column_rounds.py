@@ -43,19 +43,20 @@ class Rounds:
 
     Args:
       request: the lanes.
+      exact: the model on the host, if best responses are found there (`exact_where_better`).
       limit: columns of a lane.
       width: lanes of one program.
       workers: programs at a time, run by `run`: a `map` over threads.
     """
 
-    def __init__(self, request: Request, limit: int, width: int, workers: int, run: Callable):
+    def __init__(self, request: Request, exact: Exact | None, limit: int, width: int, workers: int, run: Callable):
         mdp, self._request, self._limit = request.model.mdp, request, limit
         self._width, self._workers, self._run = width, workers, run
         self._mdp, self._pool = request.model.once(with_compact_features), PolicyPool(mdp)
         self._room = capacities(mdp.num_features)[-1]
         self._pulls = _FEW_PULLS if mdp.num_features <= _FEW_FEATURES else _PULLS
         self._error = 0.25 * SLACK * float(request.tolerance.min())
-        self._exact = request.model.once(_exact_where_rough) or _exact_if_small(request)
+        self._exact = exact
 
     def programs(self) -> list[Callable[[], object]]:
         """Calls that compile what the first round is going to run, where that is done in programs; once."""
@@ -236,6 +237,11 @@ class Rounds:
             stopped=np.where(counts >= self._limit, Status.ITERATION_LIMIT, Status.STALLED),
             negligible=RARE_STATES,
         )
+
+
+def exact_where_better(request: Request) -> Exact | None:
+    """The model on the host, where best responses by linear solves are right, or the first of them sooner there."""
+    return request.model.once(_exact_where_rough) or _exact_if_small(request)
 
 
 def _exact_where_rough(mdp: MDP) -> Exact | None:

@@ -27,7 +27,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom.apprenticeship.column_lane import Lane
-from jaxhom.apprenticeship.column_rounds import Rounds
+from jaxhom.apprenticeship.column_rounds import Rounds, exact_where_better
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found, LPALMethod
 from jaxhom.models.mdp import MDP
@@ -65,9 +65,10 @@ class Columns:
 
     def __init__(self, request: Request):
         self._limit, self._progress, total = request.limit or DEFAULT_COLUMNS, request.progress, len(request.lanes)
-        workers, width = _workers_and_width(request.model.mdp, total)
+        exact = exact_where_better(request)
+        workers, width = _workers_and_width(request.model.mdp, total, is_on_host=exact is not None)
         self._threads, self._most = ThreadPoolExecutor(workers), _LANES_AT_A_TIME * workers * width
-        self._rounds = Rounds(request, self._limit, width, workers, self._threads.map)
+        self._rounds = Rounds(request, exact, self._limit, width, workers, self._threads.map)
         for compile_ahead in self._rounds.programs():  # while the first policies are evaluated
             self._threads.submit(compile_ahead)
         self._lanes = self._rounds.lanes()
@@ -122,8 +123,10 @@ class Columns:
         return self._rounds.found(self._lanes, offered_by)
 
 
-def _workers_and_width(mdp: MDP, total: int) -> tuple[int, int]:
+def _workers_and_width(mdp: MDP, total: int, *, is_on_host: bool) -> tuple[int, int]:
     """Programs at a time, and lanes of each."""
+    if is_on_host:  # where Python takes turns: two threads take as long for two queries as one, and rounds need both
+        return 1, 1
     on_cpu = jax.default_backend() == "cpu"
     # Two programs that both call LAPACK can wait for each other for ever (see `jaxhom.solvers.inverse_factor`).
     workers = num_cores() if on_cpu and not is_solved_by_lu(mdp) else 1

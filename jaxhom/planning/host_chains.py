@@ -130,6 +130,8 @@ class HostModel:
 
     def _transition(self, policy) -> np.ndarray | scipy.sparse.csr_array:
         states = np.arange(self.num_states)
+        if policy.ndim == 2 and (np.count_nonzero(policy, axis=1) == 1).all():
+            policy = policy.argmax(axis=1)
         if policy.ndim == 1:
             return self.rows[states * self.num_actions + policy]
         policy = np.asarray(policy, np.float64)

@@ -28,6 +28,7 @@ def cells_of(path: pathlib.Path) -> list[dict[str, Any]]:
 
 def run(path: pathlib.Path) -> Iterator[list[dict[str, Any]]]:
     """Runs the cells one after the other, and yields what each of them shows."""
+    plt.close("all")  # what others have left open in this process is no picture of the notebook
     namespace: dict[str, Any] = {"__name__": "__main__"}
     for number, cell in enumerate(cells_of(path)):
         yield _run_cell("".join(cell["source"]), f"{path.name}, cell {number}", namespace)

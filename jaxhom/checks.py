@@ -12,6 +12,8 @@ import itertools
 import math
 import operator
 import reprlib
+import sys
+import warnings
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -104,6 +106,14 @@ def refuse_traced(**options: Any) -> None:
     for name, value in options.items():
         if is_traced(value):
             raise ValueError(f"{name} is a traced value: inside jit, vmap and grad it must be a constant")
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Warns of the line that called the library, from however deep within it."""
+    library, frame, level = __name__.partition(".")[0], sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == library:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
 
 def in_one_line(value: Any) -> str:

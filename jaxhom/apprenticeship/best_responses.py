@@ -16,7 +16,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features, check_tolerance, checked_expectations
 from jaxhom.apprenticeship.certificate import ExactSides
-from jaxhom.apprenticeship.exact import exact_rows, rounded_down, rounded_up
+from jaxhom.apprenticeship.exact import exact_rows
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.presolve import Reach
@@ -27,6 +27,7 @@ from jaxhom.planning import policy_iteration
 from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
 from jaxhom.planning.optimal import optimal_policy
 from jaxhom.solvers.blas_threads import one_blas_thread
+from jaxhom.solvers.outward import rounded_down, rounded_up
 from jaxhom.status import Status
 
 if TYPE_CHECKING:

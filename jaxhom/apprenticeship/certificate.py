@@ -16,12 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.apprenticeship.exact import ENOUGH, NEAR_ONE, Exact, exact_rows, rounded_down, rounded_up
+from jaxhom.apprenticeship.exact import ENOUGH, NEAR_ONE, Exact, exact_rows
 from jaxhom.apprenticeship.presolve import Reduction
 from jaxhom.apprenticeship.solution import Found, LPALSolution
 from jaxhom.models.mdp import MDP
 from jaxhom.planning.occupancy import occupancy, policy_from_occupancy
 from jaxhom.solvers.lane_queue import map_on_cores
+from jaxhom.solvers.outward import rounded_down, rounded_up
 from jaxhom.status import Status
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from jaxhom.planning import policy_iteration
 from jaxhom.planning.host_chains import host_model
 
 if TYPE_CHECKING:
-    from jaxtyping import ArrayLike, Bool, Float, Int
+    from jaxtyping import Bool, Float, Int
 
 NEAR_ONE = 0.998  # a discount above which linear systems are better solved on the host
 _EPS = np.finfo(np.float64).eps
@@ -300,18 +300,3 @@ def exact_rows(policy: Float[np.ndarray, "*B S A"], dtype: np.dtype | type) -> F
     rest = count - steps.sum(axis=-1, keepdims=True)
     np.put_along_axis(steps, largest, np.take_along_axis(steps, largest, axis=-1) + rest, axis=-1)
     return (steps / count).astype(dtype)
-
-
-def rounded_down(numbers: Float[ArrayLike, "..."], dtype: np.dtype | type) -> Float[np.ndarray, "..."]:
-    """The largest numbers of the type that are not above the given ones."""
-    numbers = np.asarray(numbers, np.float64)
-    with np.errstate(over="ignore"):
-        rounded = numbers.astype(dtype)
-    # In float64: Python numbers would be compared in the shorter type, where the two are equal.
-    is_above = rounded.astype(np.float64) > numbers
-    return np.where(is_above, np.nextafter(rounded, np.array(-np.inf, dtype)), rounded)
-
-
-def rounded_up(numbers: Float[ArrayLike, "..."], dtype: np.dtype | type) -> Float[np.ndarray, "..."]:
-    """The smallest numbers of the type that are not below the given ones."""
-    return -rounded_down(-np.asarray(numbers, np.float64), dtype)

@@ -27,7 +27,7 @@ from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features
 from jaxhom.apprenticeship.best_responses import Responder, require_features
 from jaxhom.apprenticeship.certificate import ExactSides
-from jaxhom.apprenticeship.exact import compact_features, rounded_down, rounded_up
+from jaxhom.apprenticeship.exact import compact_features
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.models.demonstrations import Demonstrations, monte_carlo_feature_expectations
 from jaxhom.models.inputs import as_model, check_policy
@@ -36,6 +36,7 @@ from jaxhom.planning.host_chains import host_model
 from jaxhom.planning.occupancy import feature_expectations, occupancy
 from jaxhom.planning.optimal import optimal_policy
 from jaxhom.solvers.blas_threads import one_blas_thread
+from jaxhom.solvers.outward import rounded_down, rounded_up
 from jaxhom.solvers.sum_of_minima import SumOfMinima
 from jaxhom.status import Status
 

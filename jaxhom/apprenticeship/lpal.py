@@ -17,7 +17,6 @@ itself, `interior_point` an interior-point method on the same, and `quickest` ch
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -256,7 +255,7 @@ def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tol
 def _checked_method(method: str) -> str:
     """A method of the table; under its former name with a warning."""
     if isinstance(method, str) and method in FORMER_METHODS:
-        warnings.warn(f"method={method!r} is now called {FORMER_METHODS[method]!r}", DeprecationWarning, stacklevel=3)
+        checks.warn(f"method={method!r} is now called {FORMER_METHODS[method]!r}", DeprecationWarning)
         return FORMER_METHODS[method]
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method must be one of {tuple(METHODS)}, got {method!r}")

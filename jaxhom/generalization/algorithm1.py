@@ -7,7 +7,6 @@ growing before, the policy at s is uniform.
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -112,7 +111,7 @@ def soft_local_homomorphism(
     and weights are additions.
     """
     if similarity is not None:
-        warnings.warn("similarity is now called table", DeprecationWarning, stacklevel=3)
+        checks.warn("similarity is now called table", DeprecationWarning)
         if table is not None:
             raise ValueError("similarity is the former name of table: give one of them")
         table = similarity

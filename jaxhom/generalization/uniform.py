@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
 from jaxhom import checks
@@ -70,9 +68,8 @@ def maximum_entropy(mdp: MDP, demonstrations: Demonstrations) -> Generalization:
       >>> print(*(warning.category.__name__ for warning in said))
       DeprecationWarning
     """
-    warnings.warn(
+    checks.warn(
         "maximum_entropy is now called uniform_elsewhere: it is no maximum-entropy inverse reinforcement learning",
         DeprecationWarning,
-        stacklevel=2,
     )
     return uniform_elsewhere(mdp, demonstrations)

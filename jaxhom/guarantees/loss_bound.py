@@ -23,7 +23,6 @@ import numpy as np
 
 from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features
-from jaxhom.apprenticeship.exact import rounded_down, rounded_up
 from jaxhom.guarantees import all_time, first_steps
 from jaxhom.guarantees.choices import Choices, Found
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
@@ -31,6 +30,7 @@ from jaxhom.models.inputs import as_model, check_policy, require_features
 from jaxhom.models.mdp import MDP, deciding_states
 from jaxhom.models.names import Names, described
 from jaxhom.solvers.blas_threads import one_blas_thread
+from jaxhom.solvers.outward import rounded_down, rounded_up
 from jaxhom.status import Record, Status
 
 if TYPE_CHECKING:

@@ -58,7 +58,7 @@ def explore(
     weights = _start(found, start)
     columns = {} if actions is None else numbers_of("actions", tuple(actions))
     source, action, target, chance, ends = [], [], [], [], []
-    for number, state in enumerate(tqdm(found, "states", disable=not progress, unit=" states")):
+    for number, state in enumerate(tqdm(iter(found), "states", disable=not progress, unit=" states")):
         offered = _call("successors", successors, state)
         for name, outcomes in _offers(state, offered):
             column = _column(columns, state, name, is_open=actions is None)

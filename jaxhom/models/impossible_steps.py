@@ -6,11 +6,11 @@ a bad policy without a sign. What gives them away is the dynamics: T(s_t, a_t, s
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.models.mdp import MDP
 from jaxhom.models.names import described
 
@@ -52,7 +52,7 @@ def report_impossible(mdp: MDP, demonstrations: Any, impossible: str) -> None:
     )
     if impossible == "refuse":
         raise ValueError(message)
-    warnings.warn(message, ImpossibleStepsWarning, stacklevel=4)
+    checks.warn(message, ImpossibleStepsWarning)
 
 
 def known_steps(demonstrations: Any) -> Steps:

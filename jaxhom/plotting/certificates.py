@@ -110,7 +110,7 @@ def plot_certificate(
       The axes.
 
     Raises:
-      ValueError: if a shape does not fit.
+      ValueError: if a shape does not fit, or a number is not finite.
 
     Outside jit, vmap and grad only: it draws concrete numbers.
 
@@ -118,12 +118,13 @@ def plot_certificate(
       >>> plot_certificate([0.0, 0.2, 0.5], [1.0, 0.9, 0.6], label="PDHG").get_yscale()
       'log'
     """
-    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
+    lower = checks.require_floats("lower", checks.as_host_array("lower", lower))
     checks.require_shape("lower", lower, "[T] with T >= 1", lower.ndim == 1 and lower.size > 0)
-    checks.require_shape("upper", upper, str(lower.shape), upper.shape == lower.shape)
-    iterations = np.arange(1, len(lower) + 1) if iterations is None else np.asarray(iterations)
-    same = iterations.shape == lower.shape
-    checks.require_shape("iterations", iterations, str(lower.shape), same)
+    given = {"upper": upper, "iterations": np.arange(1, len(lower) + 1) if iterations is None else iterations}
+    for name, array in given.items():
+        given[name] = checks.require_floats(name, checks.as_host_array(name, array))
+        checks.require_shape(name, given[name], str(lower.shape), given[name].shape == lower.shape)
+    upper, iterations = given.values()
     if ax is None:
         _, ax = plt.subplots(figsize=(6.0, 3.8), layout="constrained")
     # A line and its dots make two entries: the next certificate takes the next colour.

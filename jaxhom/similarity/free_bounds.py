@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxhom.similarity.model_pairs import ModelPairs
+from jaxhom.solvers.outward import rounded_down
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -130,12 +131,6 @@ def _expectations_apart(source: _Expectations, target: _Expectations, rounding: 
     factor = target.keeps[:, None] + target.num_successors[:, :, None] * target.width[:, None]
     ahead = (difference / factor).max(axis=(1, 2)) / source.rows**2 * (1.0 - 8.0 * _EPS)
     return np.maximum(apart, ahead)
-
-
-def rounded_down(bounds: np.ndarray, dtype) -> np.ndarray:
-    """Lower bounds in another type, none of them larger than before."""
-    rounded = bounds.astype(dtype)
-    return np.where(rounded > bounds, np.nextafter(rounded, rounded.dtype.type(0)), rounded)
 
 
 def upper_bounds_without_iterations(models: ModelPairs) -> Float[np.ndarray, " P"]:

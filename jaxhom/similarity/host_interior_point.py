@@ -169,10 +169,7 @@ def _solve(models: _Models, tolerance: float, threshold: float) -> Answer:
         if not left.size:
             break
         with np.errstate(all="ignore"):  # a lane that breaks down is found out by its point
-            try:
-                point = _step(models, point)
-            except np.linalg.LinAlgError:  # one of the systems is singular in float64: rounding ends here
-                break
+            point = _step_of_each(models, point)
     dtype = models.certificate.dtype
     return Answer(lower.astype(dtype), upper.astype(dtype), steps, maps.astype(dtype))
 
@@ -186,6 +183,18 @@ def _start(models: _Models) -> _Point:
     y = 0.5 * weight[:, None, None, None] * models.is_row
     e = 1.5 * np.abs(models.forward(f)).max(axis=(1, 2, 3)) + 0.1
     return _Point(f=f, e=e, plus=y, minus=y.copy(), z=weight[:, None, None] * models.free)
+
+
+def _step_of_each(models: _Models, point: _Point) -> _Point:
+    """The next points; NaN for lanes whose system is singular in float64, where rounding ends the work."""
+    try:
+        return _step(models, point)
+    except np.linalg.LinAlgError:
+        if len(point.e) == 1:
+            return _Point(*(np.full_like(leaf, np.nan) for leaf in point))
+    halves = (slice(None, len(point.e) // 2), slice(len(point.e) // 2, None))
+    found = [_step_of_each(models.part(half), point.part(half)) for half in halves]
+    return _Point(*map(np.concatenate, zip(*found, strict=True)))
 
 
 def _step(models: _Models, point: _Point) -> _Point:

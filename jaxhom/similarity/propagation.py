@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxhom.similarity.blocks import Blocks
-from jaxhom.similarity.free_bounds import rounded_down
 from jaxhom.similarity.host_certificates import Certificate
 from jaxhom.similarity.model_pairs import ModelPairs
+from jaxhom.solvers.outward import rounded_down
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

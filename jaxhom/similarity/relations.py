@@ -20,6 +20,7 @@ from jaxhom.similarity.classes import quantum_bits
 from jaxhom.similarity.graph_kernels import colour_counts, cosines, walks_in_common
 from jaxhom.similarity.lax_pairs import LaxPairs
 from jaxhom.similarity.local_models import is_oversized
+from jaxhom.solvers.outward import rounded_down, rounded_up
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -93,8 +94,8 @@ class _WithoutPrograms:
         bounds[~is_large] = self._bounds(pairs[~is_large], progress)
         lower, upper = bounds.T
         return LocalSimilarity(
-            lower=np.maximum(_towards(lower, -np.inf, self._dtype), 0.0),
-            upper=_towards(upper, np.inf, self._dtype),
+            lower=np.maximum(rounded_down(lower, self._dtype), 0.0),
+            upper=rounded_up(upper, self._dtype),
             iterations=np.zeros(len(pairs), np.int32),
             status=np.where(is_large, Status.ITERATION_LIMIT, Status.SOLVED).astype(np.int32),
         )
@@ -237,10 +238,3 @@ def _one_minus(kernel) -> Float[np.ndarray, "Q 2"]:
     """Bounds on 1 - k, which rounding may be below 0."""
     rounding = _ROUNDING * np.finfo(float).eps
     return np.clip(1.0 - kernel, 0.0, 1.0)[:, None] + np.array([-rounding, rounding])
-
-
-def _towards(bound, direction: float, dtype):
-    """The nearest number of the type on that side."""
-    rounded = bound.astype(dtype)
-    is_wrong = (rounded < bound) if direction > 0 else (rounded > bound)
-    return np.where(is_wrong, np.nextafter(rounded, np.asarray(direction, dtype)), rounded)

@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 import jaxhom
 from jaxhom import MDP, Status, lpal
 from jaxhom.apprenticeship import exact as exact_module
-from jaxhom.apprenticeship.exact import Exact, exact_rows, rounded_down
+from jaxhom.apprenticeship.exact import Exact, exact_rows
 from jaxhom.apprenticeship.flow_splitting import project_weighted_simplex
 from jaxhom.apprenticeship.presolve import Reach, default_tolerance, reduce_expectations
 from jaxhom.solvers.normal_equations import Rows
@@ -316,13 +316,6 @@ def test_rows_that_sum_to_exactly_one(dtype, rng):
     np.testing.assert_array_equal(rows.astype(float).sum(axis=1), 1.0)
     np.testing.assert_array_equal(rows[:50, 2:], 0.0)
     np.testing.assert_allclose(rows, policy, rtol=0, atol=8 * np.finfo(dtype).eps)
-
-
-@pytest.mark.parametrize("number", [0.1, -0.1, 1000.01, -7669.289551, 1e30, -1e30, 0.0, 0.5])
-def test_rounding_down(number):
-    rounded = rounded_down(number, np.float32)
-    assert rounded.dtype == np.float32
-    assert float(rounded) <= number < float(np.nextafter(rounded, np.float32(np.inf)))
 
 
 # ----------------------------------------------------------------------------------------------- limits

@@ -243,3 +243,9 @@ def test_errors_in_arrays_use_names(fail, message):
     mdp = MDP.from_dense(np.full((2, 2, 2), 0.5), discount=0.9, features=np.ones((2, 1)), allowed=allowed, **names)
     with pytest.raises(ValueError, match=re.escape(message)):
         fail(mdp)
+
+
+def test_progress_counts_the_states_that_are_met(capsys):
+    MDP.from_function(lake, (0, 0), discount=0.9, progress=True)
+    last = capsys.readouterr().err.split("\r")[-1]
+    assert "16 states" in last and "/" not in last.partition("[")[0]

@@ -86,8 +86,9 @@ def test_a_final_state_is_checked_and_a_step_that_is_hidden_is_not():
 def test_what_is_done_about_them_is_an_option():
     mdp, junk = corridor(), Demonstrations.from_trajectories([([0, 3], [1, 1])])
     junk.validate(mdp, "ignore")
-    with pytest.warns(ImpossibleStepsWarning, match="1 of 1 steps"):
+    with pytest.warns(ImpossibleStepsWarning, match="1 of 1 steps") as warned:
         junk.validate(mdp, impossible="warn")
+    assert [warning.filename for warning in warned] == [__file__]
     with pytest.raises(ValueError, match="1 of 1 steps"):
         junk.validate(mdp)
     with pytest.raises(ValueError, match='impossible must be "refuse", "warn" or "ignore", got None'):
@@ -105,8 +106,9 @@ def test_what_is_done_about_them_is_an_option():
 )
 def test_who_uses_them_is_warned(use):
     mdp, junk = corridor(features=np.eye(6)), Demonstrations.from_trajectories([([0, 3], [1, 1])])
-    with pytest.warns(ImpossibleStepsWarning, match="1 of 1 steps"):
+    with pytest.warns(ImpossibleStepsWarning, match="1 of 1 steps") as warned:
         use(mdp, junk)
+    assert [warning.filename for warning in warned] == [__file__] * len(warned)
 
 
 def test_actions_that_are_not_allowed_are_refused_whatever_the_option():

@@ -248,6 +248,7 @@ MALFORMED = {
         lambda w, t: plotting.plot_certificate(np.ones(2), np.ones(2), iterations=[1]),
         "iterations must",
     ),
+    "no number": (lambda w, t: plotting.plot_certificate([0.0, np.nan], np.ones(2)), r"lower\[1\] must be finite"),
     "history": (lambda w, t: plotting.plot_bounds(np.ones((3, 2))), r"history must have shape \[T, 3\]"),
     "no history": (lambda w, t: plotting.plot_bounds([]), r"history must have shape \[T, 3\]"),
     "infinite history": (lambda w, t: plotting.plot_bounds([(1, 0, np.inf)]), r"history\[0, 2\] must be finite"),

@@ -7,7 +7,7 @@ import oracles
 import pytest
 
 from jaxhom import gridworld, local_similarity, locally_similar
-from jaxhom.similarity import brackets, newton
+from jaxhom.similarity import brackets, host_interior_point, newton
 from jaxhom.similarity.brackets import Goal, bracket_errors
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.host_certificates import forward
@@ -152,3 +152,21 @@ def test_pairs_of_mixed_sizes_are_solved_as_if_alone(rng):
     for k, (n, m) in enumerate(sizes):
         np.testing.assert_allclose(found.maps[k, :n, :m].sum(axis=1), 1.0, rtol=0, atol=1e-12)
         assert not found.maps[k, n:].any() and not found.maps[k, :, m:].any()
+
+
+def test_a_singular_lane_stops_alone(monkeypatch, rng):
+    source, target = random_models(rng, 7, 4, 2), random_models(rng, 7, 3, 2)
+    whole, step = solve(source, target), host_interior_point._step
+
+    def fail_where(models, point):
+        if np.any(np.all(models.source == source[2], axis=(1, 2, 3))):
+            raise np.linalg.LinAlgError
+        return step(models, point)
+
+    monkeypatch.setattr(host_interior_point, "_step", fail_where)
+    found = solve(source, target)
+    others = np.arange(7) != 2
+    np.testing.assert_allclose(found.upper[others], whole.upper[others], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(found.steps[others], whole.steps[others])
+    assert found.steps[2] < whole.steps[2]
+    assert found.lower[2] <= whole.upper[2] <= found.upper[2] < np.inf

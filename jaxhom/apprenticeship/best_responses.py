@@ -152,7 +152,7 @@ class Outcome:
         )
 
 
-def solve_lanes(
+def learn_lane_by_lane(
     name: str,
     mdp: MDP,
     expectations: Float[ArrayLike, "*B K"],

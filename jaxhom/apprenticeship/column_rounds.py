@@ -15,10 +15,16 @@ import numpy as np
 
 from jaxhom.apprenticeship.column_games import capacities, play, prepare
 from jaxhom.apprenticeship.column_lane import SLACK, Lane
+from jaxhom.apprenticeship.column_responses import (
+    evaluate,
+    evaluate_on_host,
+    respond,
+    respond_on_host,
+    with_compact_features,
+)
 from jaxhom.apprenticeship.exact import NEAR_ONE, Exact
 from jaxhom.apprenticeship.policy_pool import PolicyPool
 from jaxhom.apprenticeship.request import Request
-from jaxhom.apprenticeship.responses import evaluate, evaluate_on_host, respond, respond_on_host, with_compact_features
 from jaxhom.apprenticeship.solution import RARE_STATES, Found, LPALMethod
 from jaxhom.models.mdp import MDP, uniform_policy
 from jaxhom.planning.occupancy import policy_from_occupancy

@@ -19,11 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhom.apprenticeship.column_responses import expected_features
 from jaxhom.apprenticeship.flow_splitting import STEPS_PER_WEIGHT, Goal, State, advance, begin
+from jaxhom.apprenticeship.model_in_program import ModelInProgram
 from jaxhom.apprenticeship.planning_bound import UpperBound, bound_by_planning
 from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectations
-from jaxhom.apprenticeship.program import Program
-from jaxhom.apprenticeship.responses import expected_features
 from jaxhom.apprenticeship.solution import RARE_STATES, LPALMethod, LPALSolution
 from jaxhom.models.mdp import MDP, push_forward, uniform_policy
 from jaxhom.planning.occupancy import policy_from_occupancy
@@ -82,7 +82,7 @@ class _Standing(Record):
 
 
 def solve_in_program(
-    program: Program,
+    program: ModelInProgram,
     expectations: Float[Array, "B K"],
     *,
     tolerance: float | Float[np.ndarray, " B"] | None,
@@ -106,7 +106,7 @@ def solve_in_program(
 
 
 @functools.partial(jax.jit, static_argnames="looks")
-def _solve(program: Program, asked: Asked, looks: int) -> LPALSolution:
+def _solve(program: ModelInProgram, asked: Asked, looks: int) -> LPALSolution:
     @jax.custom_batching.custom_vmap
     def solve_batch(program, asked):
         return _solve_in_chunks(program, asked, looks)
@@ -128,7 +128,7 @@ def _solve(program: Program, asked: Asked, looks: int) -> LPALSolution:
     return solve_batch(program, asked)
 
 
-def _solve_in_chunks(program: Program, asked: Asked, looks: int) -> LPALSolution:
+def _solve_in_chunks(program: ModelInProgram, asked: Asked, looks: int) -> LPALSolution:
     """Some lanes at a time, equally many; the surplus repeats the first."""
     total = len(asked.expectations)
     chunks = -(-total // _MOST_LANES)
@@ -141,7 +141,7 @@ def _solve_in_chunks(program: Program, asked: Asked, looks: int) -> LPALSolution
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], found)
 
 
-def _solve_chunk(program: Program, asked: Asked, looks: int) -> LPALSolution:
+def _solve_chunk(program: ModelInProgram, asked: Asked, looks: int) -> LPALSolution:
     reduction = reduce_expectations(program.reach, asked.expectations)
     tolerance = default_tolerance(program.reach, reduction) if asked.tolerance is None else asked.tolerance
     target, gap = reduction.expectations / program.unit, tolerance / program.unit
@@ -165,7 +165,7 @@ def _solve_chunk(program: Program, asked: Asked, looks: int) -> LPALSolution:
     return _certified(program, asked, reduction, tolerance, now, looks)
 
 
-def _start(program: Program, goal: Goal, asked: Asked, looks: int) -> _Standing:
+def _start(program: ModelInProgram, goal: Goal, asked: Asked, looks: int) -> _Standing:
     """Without any column."""
     (count, num_features), pairs, dtype = asked.expectations.shape, program.mdp.allowed.shape, program.mdp.dtype
     room = min(_COLUMNS_PER_LOOK * (looks + 1), _MOST_COLUMNS)
@@ -195,7 +195,9 @@ def _where(choice: Bool[Array, " B"], new: _Standing, old: _Standing) -> _Standi
     return jax.tree.map(choose, new.replace(flow=None), old.replace(flow=None)).replace(flow=flow)
 
 
-def _look(program: Program, policy, goal: Goal, target, gap, now: _Standing, number: Int[Array, ""]) -> _Standing:
+def _look(
+    program: ModelInProgram, policy, goal: Goal, target, gap, now: _Standing, number: Int[Array, ""]
+) -> _Standing:
     """One pass. The first has no iterations: it looks at the policy and the weights to begin with."""
     mdp, splitting, is_first = program.mdp, program.splitting, number == 0
     steps = jnp.where(is_first, 0, _ITERATIONS_PER_LOOK // STEPS_PER_WEIGHT)
@@ -269,7 +271,7 @@ def _with_game(now: _Standing, target: Float[Array, "B K"], gap: Float[Array, " 
     )
 
 
-def _certified(program: Program, asked: Asked, reduction, tolerance, now: _Standing, looks: int) -> LPALSolution:
+def _certified(program: ModelInProgram, asked: Asked, reduction, tolerance, now: _Standing, looks: int) -> LPALSolution:
     """What the lanes end with, in the caller's units; the margin is proved by the flow of the policy's occupancy."""
     mdp, unit, eps = program.mdp, program.unit, jnp.finfo(program.mdp.dtype).eps
     x = jnp.einsum("bc,bcsa->bsa", now.q, now.x)

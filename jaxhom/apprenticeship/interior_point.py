@@ -66,7 +66,7 @@ class Point:
     status: Status
 
 
-class Program:
+class LinearProgram:
     """The linear program of a model, for any expectations.
 
     Attributes:
@@ -164,12 +164,12 @@ class Program:
 
 def is_banded(model: PreparedModel) -> bool:
     """Whether a step costs so little that a few dozen of them are quicker than columns."""
-    return not model.mdp.is_dense and model.once(Program).work <= _MOST_WORK
+    return not model.mdp.is_dense and model.once(LinearProgram).work <= _MOST_WORK
 
 
 def solve_by_interior_point(request: Request) -> Found:
     """An interior method starts in the middle of what is feasible: what there is to begin with is not used."""
-    program, total = request.model.once(Program), len(request.lanes)
+    program, total = request.model.once(LinearProgram), len(request.lanes)
     limit = np.full(total, request.limit or DEFAULT_STEPS)
     with tqdm(desc="LPAL", unit="lane", total=total, disable=not request.progress) as bar:
         points = _compiled(program, request, limit, bar.update) if total >= _MANY_LANES else None
@@ -192,7 +192,7 @@ def solve_by_interior_point(request: Request) -> Found:
     )
 
 
-def _compiled(program: Program, request: Request, limit: np.ndarray, progress: Callable) -> list[Point] | None:
+def _compiled(program: LinearProgram, request: Request, limit: np.ndarray, progress: Callable) -> list[Point] | None:
     """The lanes by compiled programs; None where the model has none, or rounding lets none begin."""
     if not program.is_compiled:
         return None

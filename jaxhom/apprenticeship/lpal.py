@@ -35,10 +35,10 @@ from jaxhom.apprenticeship.certificate import Certifier
 from jaxhom.apprenticeship.columns import solve_by_columns
 from jaxhom.apprenticeship.in_program import ITERATIONS, solve_in_program
 from jaxhom.apprenticeship.interior_point import solve_by_interior_point
+from jaxhom.apprenticeship.model_in_program import ModelInProgram
 from jaxhom.apprenticeship.pdhg import solve_by_pdhg
 from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.presolve import default_tolerance, reduce_expectations
-from jaxhom.apprenticeship.program import Program
 from jaxhom.apprenticeship.quickest import solve_by_the_quickest
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.sensitivity import with_derivatives, without_tangents
@@ -168,7 +168,7 @@ class LPAL:
         require_features(self._mdp)
         model = without_tangents(self._mdp)
         if checks.is_traced(model):
-            self._model, self._program = None, Program.of_traced(model)
+            self._model, self._program = None, ModelInProgram.of_traced(model)
         else:
             check_features(model)
             self._model = PreparedModel(model)
@@ -231,9 +231,9 @@ class LPAL:
         return solve_in_program(self._program, jnp.asarray(batch), tolerance=tolerance, max_iterations=limit, **start)
 
     @functools.cached_property
-    def _program(self) -> Program:
+    def _program(self) -> ModelInProgram:
         with checks.at_once():
-            return Program.of_concrete(self._model)
+            return ModelInProgram.of_concrete(self._model)
 
 
 def _presolved(model: PreparedModel, expectations: Float[np.ndarray, "B K"], tolerance) -> Request:

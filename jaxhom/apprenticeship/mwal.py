@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.best_responses import Outcome, Proposal, Responder, goal_of, mixture, solve_lanes
+from jaxhom.apprenticeship.best_responses import Outcome, Proposal, Responder, goal_of, learn_lane_by_lane, mixture
 from jaxhom.apprenticeship.certificate import ExactSides, simplex_point
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.presolve import Reach, reduce_expectations
@@ -103,7 +103,7 @@ def mwal(
         proposal = _rounds(sides, reach, expectations, goal_of(sides.mdp, tolerance), limit)
         return _certified(sides, expectations, tolerance, proposal)
 
-    return solve_lanes("mwal", mdp, expectations, tolerance, _default_tolerance, solve)
+    return learn_lane_by_lane("mwal", mdp, expectations, tolerance, _default_tolerance, solve)
 
 
 def _default_tolerance(reach: Reach, expectations: Float[np.ndarray, "B K"]) -> Float[np.ndarray, " B"]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.apprenticeship.best_responses import Outcome, Proposal, Responder, goal_of, mixture, solve_lanes
+from jaxhom.apprenticeship.best_responses import Outcome, Proposal, Responder, goal_of, learn_lane_by_lane, mixture
 from jaxhom.apprenticeship.certificate import ExactSides
 from jaxhom.apprenticeship.learned import Learned
 from jaxhom.apprenticeship.presolve import Reach
@@ -102,7 +102,7 @@ def projection(
         proposal = _rounds(sides, expectations, goal_of(sides.mdp, tolerance), limit, _METHODS[method])
         return _certified(sides, expectations, tolerance, proposal)
 
-    return solve_lanes("projection", mdp, expectations, tolerance, _default_tolerance, solve)
+    return learn_lane_by_lane("projection", mdp, expectations, tolerance, _default_tolerance, solve)
 
 
 def _default_tolerance(reach: Reach, expectations: Float[np.ndarray, "B K"]) -> float:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom.apprenticeship.columns import solve_by_columns
-from jaxhom.apprenticeship.interior_point import Program, is_banded, solve_by_interior_point
+from jaxhom.apprenticeship.interior_point import LinearProgram, is_banded, solve_by_interior_point
 from jaxhom.apprenticeship.pdhg import solve_by_pdhg
 from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.request import Request
@@ -70,7 +70,7 @@ def _sum_of_features(mdp: MDP) -> float:
 
 def _is_small(model: PreparedModel) -> bool:
     """Whether a step of the interior point takes a few milliseconds."""
-    return model.mdp.num_states <= _SMALL_STATES and model.once(Program).work <= _SMALL_WORK
+    return model.mdp.num_states <= _SMALL_STATES and model.once(LinearProgram).work <= _SMALL_WORK
 
 
 def _most_features_of_a_pair(mdp: MDP) -> int:

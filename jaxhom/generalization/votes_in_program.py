@@ -32,7 +32,7 @@ from jaxhom.status import Status
 _UNROLL = 2  # successors whose sets are united in one pass; XLA repeats a union without a loop in all that reads it
 
 
-class Found(NamedTuple):
+class FoundVotes(NamedTuple):
     """What a search found: the votes, and `undecided` [S] and `status` as in `Generalization`."""
 
     votes: Votes
@@ -80,7 +80,9 @@ def vote_of_rings(mdp: MDP, start: Generalization, experts, asking) -> Votes:
     return _elected(mdp, search, sum_of_policies(_unpacked(search.voters, len(experts)), start.policy, experts))
 
 
-def vote_by_rule(mdp: MDP, start: Generalization, experts, asking, table: SimilarityTable, rule: VotingRule) -> Found:
+def vote_by_rule(
+    mdp: MDP, start: Generalization, experts, asking, table: SimilarityTable, rule: VotingRule
+) -> FoundVotes:
     """As `voting.HostBallots.elect`, where the table is complete for the rule."""
     relation = table.relation(**rule.of_table, with_errors=rule.is_weighted)
     ballots = _Ballots(mdp, start.policy, experts, relation, rule)
@@ -96,7 +98,7 @@ def vote_by_rule(mdp: MDP, start: Generalization, experts, asking, table: Simila
         count = _count(search.asked & may_vote & _by_class(relation, relation.status == reason, experts))
         undecided += count
         status = jnp.where(count.any(), jnp.int32(reason), status)
-    return Found(votes, undecided, status)
+    return FoundVotes(votes, undecided, status)
 
 
 class _Ballots(NamedTuple):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from jaxhom.guarantees.choices import Choices, Found
+from jaxhom.guarantees.choices import BestChoices, Choices
 from jaxhom.planning import policy_iteration
 from jaxhom.status import Status
 
@@ -35,7 +35,7 @@ _DIRECT = 1e7  # states times bandwidth up to which a direct solve takes less th
 _TOLERANCE, _ROUNDINGS = 1e-12, 8.0  # of what b may span: a share of the largest |feature|, and roundings of |V|
 
 
-def best(choices: Choices, progress: bool = False) -> Found:
+def best(choices: Choices, progress: bool = False) -> BestChoices:
     """The best policy for each feature, with a bar over features if `progress`."""
     shape = len(choices.initial), len(choices.size)
     value, status = np.zeros(shape), Status.SOLVED
@@ -50,7 +50,7 @@ def best(choices: Choices, progress: bool = False) -> Found:
     return _found(choices, value, actions, status)
 
 
-def of_policy(choices: Choices) -> Found:
+def of_policy(choices: Choices) -> BestChoices:
     """The values of a policy, of choices in which every state is fixed."""
     actions = choices.first
     value = _solved(choices, actions, choices.own_reward, is_flow=False)
@@ -58,7 +58,9 @@ def of_policy(choices: Choices) -> Found:
     return _found(choices, np.nan_to_num(value), np.broadcast_to(actions[:, None], value.shape), status)
 
 
-def contributions(choices: Choices, best: Found, own: Found, share: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
+def contributions(
+    choices: Choices, best: BestChoices, own: BestChoices, share: Float[np.ndarray, " K"]
+) -> Float[np.ndarray, " S"]:
     """What every state adds to the loss of a policy against the best choices.
 
     Args:
@@ -75,11 +77,11 @@ def contributions(choices: Choices, best: Found, own: Found, share: Float[np.nda
     return total
 
 
-def _found(choices: Choices, value, actions, status: int) -> Found:
+def _found(choices: Choices, value, actions, status: int) -> BestChoices:
     gain = choices.backup(value, slice(None)).max(axis=1) - value
     largest = np.abs(value).max(axis=0)
     lower, upper = choices.bounds(value, (gain.min(axis=0), gain.max(axis=0)), largest)
-    return Found(lower, upper, value, actions, int(status))
+    return BestChoices(lower, upper, value, actions, int(status))
 
 
 class _Planned(NamedTuple):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _EPS = np.finfo(np.float64).eps
 
 
-class Found(NamedTuple):
+class BestChoices(NamedTuple):
     """The best choices for every feature.
 
     Attributes:

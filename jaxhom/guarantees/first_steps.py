@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxhom.guarantees.choices import Choices, Found
+from jaxhom.guarantees.choices import BestChoices, Choices
 from jaxhom.status import Status
 
 if TYPE_CHECKING:
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 _NUMBERS_AT_A_TIME = 2**22  # values of all times that are held together
 
 
-def best(choices: Choices, horizon: int) -> Found:
+def best(choices: Choices, horizon: int) -> BestChoices:
     """What the best policies of the first `horizon` steps are worth; one policy's worth, if every state is fixed."""
     largest = nothing = np.zeros(len(choices.size))
     for step in _backward(choices, slice(None), horizon):
         value, action_value = step
         largest = np.maximum(largest, np.abs(value).max(axis=0))
     lower, upper = choices.bounds(value, (nothing, nothing), largest, horizon)
-    return Found(lower, upper, value, _chosen(choices, action_value), int(Status.SOLVED))
+    return BestChoices(lower, upper, value, _chosen(choices, action_value), int(Status.SOLVED))
 
 
 def contributions(

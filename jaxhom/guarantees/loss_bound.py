@@ -24,7 +24,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.apprenticeship.arguments import check_features
 from jaxhom.guarantees import all_time, first_steps
-from jaxhom.guarantees.choices import Choices, Found
+from jaxhom.guarantees.choices import BestChoices, Choices
 from jaxhom.models.demonstrations import Demonstrations, empirical_policy
 from jaxhom.models.inputs import as_model, check_policy, require_features
 from jaxhom.models.mdp import MDP, deciding_states
@@ -218,12 +218,14 @@ class Agreeing:
             state_names=self._mdp.state_names,
         )
 
-    def _plan(self, choices: Choices, progress: bool) -> Found:
+    def _plan(self, choices: Choices, progress: bool) -> BestChoices:
         if self._horizon is None:
             return all_time.best(choices, progress)
         return first_steps.best(choices, self._horizon)
 
-    def _contributions(self, policy: Choices, own: Found, share: Float[np.ndarray, " K"]) -> Float[np.ndarray, " S"]:
+    def _contributions(
+        self, policy: Choices, own: BestChoices, share: Float[np.ndarray, " K"]
+    ) -> Float[np.ndarray, " S"]:
         if self._horizon is None:
             return all_time.contributions(self._choices, self._best, own, share)
         return first_steps.contributions(self._choices, policy, share, self._horizon)

@@ -120,11 +120,11 @@ def plot_certificate(
     """
     lower = checks.require_floats("lower", checks.as_host_array("lower", lower))
     checks.require_shape("lower", lower, "[T] with T >= 1", lower.ndim == 1 and lower.size > 0)
-    given = {"upper": upper, "iterations": np.arange(1, len(lower) + 1) if iterations is None else iterations}
-    for name, array in given.items():
-        given[name] = checks.require_floats(name, checks.as_host_array(name, array))
-        checks.require_shape(name, given[name], str(lower.shape), given[name].shape == lower.shape)
-    upper, iterations = given.values()
+    upper = checks.require_floats("upper", checks.as_host_array("upper", upper))
+    checks.require_shape("upper", upper, str(lower.shape), upper.shape == lower.shape)
+    iterations = np.arange(1, len(lower) + 1) if iterations is None else iterations
+    iterations = checks.require_floats("iterations", checks.as_host_array("iterations", iterations))
+    checks.require_shape("iterations", iterations, str(lower.shape), iterations.shape == lower.shape)
     if ax is None:
         _, ax = plt.subplots(figsize=(6.0, 3.8), layout="constrained")
     # A line and its dots make two entries: the next certificate takes the next colour.

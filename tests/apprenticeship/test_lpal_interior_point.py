@@ -10,7 +10,7 @@ import pytest
 import jaxhom
 from jaxhom import interop
 from jaxhom.apprenticeship import interior_point
-from jaxhom.apprenticeship.interior_point import Program
+from jaxhom.apprenticeship.interior_point import LinearProgram
 
 
 @pytest.mark.parametrize("num_regions", [16, 64])
@@ -49,7 +49,7 @@ def test_compiled_steps_find_what_the_host_finds(restricts):
         mdp = mdp.replace(allowed=np.random.default_rng(0).random((256, mdp.num_actions)) < 0.9)
     rng = np.random.default_rng(1)
     expectations, tolerance = rng.uniform(0.0, 20.0, (3, mdp.num_features)) * [[1.0], [0.1], [1.0]], np.full(3, 1e-6)
-    program = Program(mdp)
+    program = LinearProgram(mdp)
     points = program.solve_many(expectations, tolerance, np.array([100, 100, 2]))
     assert points[2].steps == 2
     alone = program.solve_many(expectations[:1], tolerance[:1], np.array([100]))[0]
@@ -73,7 +73,7 @@ def test_a_batch_that_cannot_be_compiled_or_begun_goes_lane_by_lane(monkeypatch)
     def spoiled(*_, **__):
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr(interior_point.Program, "solve_many", spoiled)
+    monkeypatch.setattr(interior_point.LinearProgram, "solve_many", spoiled)
     solution = jaxhom.lpal(mdp, expectations, method="interior_point")
     assert (solution.status == jaxhom.Status.SOLVED).all()
     np.testing.assert_allclose(solution.margin, expected.margin, rtol=0, atol=1e-3)

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
+from jaxhom.apprenticeship.column_responses import with_compact_features
 from jaxhom.apprenticeship.flow_factor import feature_units
 from jaxhom.apprenticeship.flow_factor_in_program import split_flow_in_program
 from jaxhom.apprenticeship.flow_splitting import Goal, Splitting, State, begin, reading
 from jaxhom.apprenticeship.pdhg import FlowProgram
 from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.presolve import Reach
-from jaxhom.apprenticeship.responses import with_compact_features
 from jaxhom.models.mdp import MDP
 from jaxhom.status import Record
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jaxtyping import Array, Float, Int
 
 
-class Program(Record):
+class ModelInProgram(Record):
     """A model as the passes see it.
 
     Attributes:
@@ -42,7 +42,7 @@ class Program(Record):
     order: Int[Array, "2 S"] | None = None
 
     @classmethod
-    def of_concrete(cls, model: PreparedModel) -> Program:
+    def of_concrete(cls, model: PreparedModel) -> ModelInProgram:
         """That of a model on the host."""
         flow = model.once(FlowProgram)
         return cls(
@@ -55,7 +55,7 @@ class Program(Record):
         )
 
     @classmethod
-    def of_traced(cls, mdp: MDP) -> Program:
+    def of_traced(cls, mdp: MDP) -> ModelInProgram:
         """That of a model whose numbers are traced."""
         size = jnp.abs(mdp.features).max(axis=(0, 1))
         unit = jnp.exp2(jnp.floor(jnp.log2(jnp.where(size.max() > 0, size.max(), 1.0))))

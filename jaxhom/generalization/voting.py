@@ -8,7 +8,8 @@ smaller the error.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -59,6 +60,11 @@ class VotingRule:
             raise ValueError(f"weights must be one of {WEIGHTS}, got {self.weights!r}")
         if not 0 < self.temperature < np.inf:
             raise ValueError(f"temperature must be positive and finite, got {self.temperature}")
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> VotingRule:
+        """That of options of which some are not about votes."""
+        return cls(**{field.name: options[field.name] for field in dataclasses.fields(cls) if field.name in options})
 
     @property
     def of_table(self) -> dict:

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable)
 Axes = Sequence[Sequence[Any] | None]  # names of the indices along each axis of an array, where they have some
 
-MAX_SLOTS = 2**31 - 2  # flat indices of the solvers are int32, and one is the padding's
+LARGEST_INDEX = 2**31 - 1  # states, actions and flat indices are int32
+MAX_SLOTS = LARGEST_INDEX - 1  # one is the padding's
 
 
 def as_host_array(name: str, value: Any) -> np.ndarray:

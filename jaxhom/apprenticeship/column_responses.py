@@ -19,6 +19,9 @@ from jaxhom.planning.chain_solver import rough_state_occupancy
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
 
+LOOSE_GAME = 0.5  # share of the open gap that a game may leave
+LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to a bound: more digits prove nothing more
+
 
 def with_compact_features(mdp: MDP) -> MDP:
     """The model with features [S, 1, K] where they do not depend on the action: a quarter of the numbers, with four."""

@@ -16,6 +16,8 @@ import numpy as np
 from jaxhom.apprenticeship.column_games import capacities, play, prepare
 from jaxhom.apprenticeship.column_lane import SLACK, Lane
 from jaxhom.apprenticeship.column_responses import (
+    LOOSE_GAME,
+    LOOSE_PLANNING,
     evaluate,
     evaluate_on_host,
     respond,
@@ -36,8 +38,6 @@ if TYPE_CHECKING:
 
 _PULLS = (0.3, 0.7)  # shares of the best bound's weights in a query; the second where a core would be idle
 _FEW_FEATURES, _FEW_PULLS = 8, (0.0, 0.5)  # up to here the weights do not jump
-_LOOSE_GAME = 0.5  # share of the open gap that the game may leave
-_LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to the bound: more digits prove nothing more
 _FROM_POOL = 8  # policies of other lanes that join a game at a time: 16 lanes of bumps24 (bench/results/speed_lpal.csv)
 # take 342 iterations, 381 if none may join
 _prepared: set[str] = set()  # kinds of models whose programs are there, or under way
@@ -138,7 +138,7 @@ class Rounds:
     def _respond(self, asked: list[tuple[Lane, float]]) -> dict[str, np.ndarray]:
         goals = [lane.tolerance for lane, _ in asked]
         open_ = [lane.gap if np.isfinite(lane.gap) else 0.0 for lane, _ in asked]
-        accuracy = np.maximum(goals, _LOOSE_PLANNING * np.array(open_))
+        accuracy = np.maximum(goals, LOOSE_PLANNING * np.array(open_))
         if self._exact is not None:
             parts = [
                 respond_on_host(self._exact, lane.expectations, lane.query(pull), lane.value, goal, self._error)
@@ -218,7 +218,7 @@ class Rounds:
         ]
         bounds = [lane.bound for lane in lanes]
         goals = [0.25 * lane.tolerance for lane in lanes]
-        return play(payoffs, former, bounds, goals, _LOOSE_GAME, self._width, on_host=self._exact is not None)
+        return play(payoffs, former, bounds, goals, LOOSE_GAME, self._width, on_host=self._exact is not None)
 
     # ---------------------------------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhom.apprenticeship.column_responses import expected_features
+from jaxhom.apprenticeship.column_responses import LOOSE_GAME, LOOSE_PLANNING, expected_features
 from jaxhom.apprenticeship.flow_splitting import STEPS_PER_WEIGHT, Goal, State, advance, begin
 from jaxhom.apprenticeship.model_in_program import ModelInProgram
 from jaxhom.apprenticeship.planning_bound import UpperBound, bound_by_planning
@@ -40,8 +40,6 @@ _MOST_LANES = 16  # at a time: more wait for the slowest, and leave a core's cac
 _COLUMNS_PER_LOOK = 3  # the policy of x, and the best responses to PDHG's weights and to those of the game
 _MOST_COLUMNS = 32  # of a game: 27 of 32 lanes of grid16 (bench.instances) close in 1,000 iterations, with 64 no more
 _PULL = 0.3  # share of the best bound's weights in the second query
-_LOOSE_GAME = 0.5  # share of the open gap that a game may leave
-_LOOSE_PLANNING = 0.1  # share of the open gap that planning may add to a bound
 _ERROR = 0.02  # share of the tolerance by which expectations of a column may be off
 _CLOSED = 0.9  # share of the tolerance at which a lane is: the rest is for what the last certificate adds
 
@@ -214,7 +212,7 @@ def _look(
         # The policy of x, the best response to the weights, and that to the game's.
         is_given, left = column == 0, now.upper - now.lower
         query = jnp.where(column >= 2, (1.0 - _PULL) * now.w + _PULL * now.weights, weights)
-        accuracy = jnp.maximum(gap, _LOOSE_PLANNING * jnp.where(jnp.isfinite(left), left, 0.0))
+        accuracy = jnp.maximum(gap, LOOSE_PLANNING * jnp.where(jnp.isfinite(left), left, 0.0))
         accuracy = jnp.where(is_given, jnp.inf, accuracy)
         bound, plan = bound_by_planning(mdp, target, query, now.value, accuracy, is_quick=True)
         now = now.replace(has_asked=(column >= 2) & ~(left <= _CLOSED * gap))
@@ -260,7 +258,7 @@ def _with_game(now: _Standing, target: Float[Array, "B K"], gap: Float[Array, " 
     def play(expected, target, gap, bound, w, q):
         is_column = jnp.isfinite(expected[:, 0])
         payoff = jnp.where(is_column[:, None], expected - target, 0.0).T
-        return solve_game(payoff, is_column, tolerance=0.25 * gap, share=_LOOSE_GAME, bound=bound, start=(w, q))
+        return solve_game(payoff, is_column, tolerance=0.25 * gap, share=LOOSE_GAME, bound=bound, start=(w, q))
 
     game = jax.vmap(play)(now.expected, target, gap, now.upper, now.w, now.q)
     is_finite = jnp.isfinite(game.lower)

@@ -18,7 +18,7 @@ from jaxhom import checks
 from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.column_names import find_columns, listed
 from jaxhom.interop.csv_rows import Table, read_table
-from jaxhom.interop.import_reports import LARGEST_INDEX, ImportReport
+from jaxhom.interop.import_reports import ImportReport
 from jaxhom.interop.numbering import NO_ACTION, Numbering, indices_by_cell, number_in_order, numberings, parsed
 from jaxhom.interop.state_sequences import inferred_actions
 from jaxhom.interop.step_assembly import assembled
@@ -175,7 +175,7 @@ def _plain_columns(table: Table, places: Mapping[str, int]) -> tuple[dict[str, n
         (columns["episode"],), names = number_in_order([cells])
     if "step" in places:
         try:
-            columns["step"] = column_of_indices(table, places["step"], Numbering("step", LARGEST_INDEX))
+            columns["step"] = column_of_indices(table, places["step"], Numbering("step", checks.LARGEST_INDEX))
         except FileError as error:
             raise FileError(f"{error}: the column numbers the steps of an episode; call it otherwise if not") from None
     for role in ("terminated", "truncated", "start"):

@@ -10,8 +10,6 @@ import numpy as np
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.status import summary
 
-LARGEST_INDEX = 2**31 - 1  # states and actions are kept as int32
-
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:

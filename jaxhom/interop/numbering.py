@@ -19,7 +19,6 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.interop.import_reports import LARGEST_INDEX
 from jaxhom.models.mdp import MDP
 from jaxhom.models.names import look_up
 
@@ -37,7 +36,7 @@ class Numbering:
       names: what a model calls them, or None.
     """
 
-    def __init__(self, kind: str, limit: int = LARGEST_INDEX, names: Sequence[Hashable] | None = None):
+    def __init__(self, kind: str, limit: int = checks.LARGEST_INDEX, names: Sequence[Hashable] | None = None):
         self.kind, self.limit, self.names = kind, limit, names
         self._remedy = "; to_states turns other observations into state indices" if kind == "state" else ""
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, model_of_entries
 from jaxhom.interop.numbering import whole_of
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 _STATE = re.compile(r"(\d+)\s*:\s*\((.*)\)")
 _LABEL = re.compile(r'(\d+)\s*=\s*"([^"]*)"')
-_UNKNOWN = 2**31 - 1  # number of states, where it is not told
+_UNKNOWN = checks.LARGEST_INDEX  # number of states, where it is not told
 _WORDS = {"true": True, "false": False}
 
 

@@ -11,6 +11,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.interop.archives import FileError
 from jaxhom.interop.text_files import open_text
 
@@ -84,7 +85,7 @@ class TextTable:
             row = int(np.argmax(wrong))
             raise self.error(row, f"expected {expected}, got {' '.join(self.row(row))!r}")
 
-    def whole_numbers(self, place: int, name: str, upper: int = 2**31 - 1, lower: int = 0) -> np.ndarray:
+    def whole_numbers(self, place: int, name: str, upper: int = checks.LARGEST_INDEX, lower: int = 0) -> np.ndarray:
         """int [rows]: a column of whole numbers in [lower, upper)."""
         numbers = self._numbers(place, name, int, "a whole number")
         wrong = (numbers < lower) | (numbers >= upper)

@@ -70,7 +70,7 @@ def with_single_steps(demonstrations: Any, states: Any, actions: Any) -> dict[st
     for name, array in given.items():
         checks.require_shape(name, array, f"({count},), as many states as actions", np.shape(array) == (count,))
         if not checks.is_traced(array):
-            given[name] = checks.require_integers(name, np.asarray(array, None if count else int), 2**31 - 1)
+            given[name] = checks.require_integers(name, np.asarray(array, None if count else int), checks.LARGEST_INDEX)
     xp = checks.arrays_of(demonstrations, given)
     is_given = xp.asarray(given["states"]) >= 0
     is_first = np.arange(demonstrations.horizon) == 0
@@ -129,6 +129,6 @@ def _validated_trajectory(index: int, pair) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"trajectory {index} has {counts}: as many are needed, or one state more, where it ended")
     if not len(actions):
         raise ValueError(f"trajectory {index} is empty")
-    upper = 2**31 - 1
+    upper = checks.LARGEST_INDEX
     states = checks.require_integers(f"trajectory {index} states", states, upper)
     return states, checks.require_integers(f"trajectory {index} actions", actions, upper)

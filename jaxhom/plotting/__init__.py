@@ -28,7 +28,6 @@ from jaxhom.plotting.numbered import (
     plot_radius_counts,
     plot_trajectories_by_state,
 )
-from jaxhom.plotting.palette import AMOUNT, BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from jaxhom.plotting.pictures import (
     plot_gridworld,
     plot_occupancy,
@@ -36,6 +35,7 @@ from jaxhom.plotting.pictures import (
     plot_racetrack,
     plot_trajectories,
 )
+from jaxhom.plotting.style import AMOUNT, BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 
 __all__ = [
     "AMOUNT",

@@ -23,7 +23,7 @@ from jaxhom.domains.racetrack import ACTIONS as RACETRACK_ACTIONS
 from jaxhom.domains.racetrack import Racetrack
 from jaxhom.domains.tile_map import TileMap
 from jaxhom.models.mdp import MDP
-from jaxhom.plotting.palette import AMOUNT, FAINT, INK, ROAD, START, WALL
+from jaxhom.plotting.style import AMOUNT, FAINT, INK, ROAD, START, WALL
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float

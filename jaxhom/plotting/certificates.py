@@ -23,7 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from jaxhom import checks
-from jaxhom.plotting.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from jaxhom.plotting.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, plain_axes
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float
@@ -82,7 +82,7 @@ def plot_bounds(
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set(xlabel="iterations", ylabel=value)
     ax.legend(frameon=False, title=f"{best[1][-1] - best[0][-1]:.1e} apart", loc="best")
-    return _plain_axes(ax)
+    return plain_axes(ax)
 
 
 def plot_certificate(
@@ -142,11 +142,4 @@ def plot_certificate(
     own = np.maximum(upper - lower, rounding)
     ax.plot(iterations, own, ".", color=color, markersize=3.5, alpha=0.3)
     ax.set(yscale="log", xlabel="iterations", ylabel="upper bound - lower bound")
-    return _plain_axes(ax)
-
-
-def _plain_axes(ax: Axes) -> Axes:
-    ax.grid(axis="y", color="#E3E3E3", linewidth=0.8)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
+    return plain_axes(ax)

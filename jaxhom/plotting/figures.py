@@ -18,8 +18,8 @@ from jaxhom.domains.gridworld import Gridworld
 from jaxhom.domains.racetrack import Racetrack
 from jaxhom.models.demonstrations import Demonstrations, sample_demonstrations
 from jaxhom.plotting.boards import Board, board_of, draw_arrows, policy_at, require
-from jaxhom.plotting.palette import BLACK, BLUE, GREEN, INK, ORANGE, PURPLE, TINT, VERMILLION
 from jaxhom.plotting.pictures import plot_gridworld, plot_racetrack, plot_trajectories, unpadded
+from jaxhom.plotting.style import BLACK, BLUE, GREEN, INK, ORANGE, PURPLE, TINT, VERMILLION
 
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Float, Key

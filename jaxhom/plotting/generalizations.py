@@ -35,13 +35,12 @@ from jaxhom.plotting.boards import (
     require,
     show,
 )
-from jaxhom.plotting.palette import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
+from jaxhom.plotting.style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SIGNS, SKY, VERMILLION, YELLOW
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Int
 
 _NOTHING, _DEMONSTRATED = -1, 0
-_NAMES = ["\N{MULTIPLICATION SIGN} nothing found", "\N{BULLET} demonstrated"]
 _MIXED = 0  # no action has more than half of the probability
 _ARROWS = {"up": "\N{UPWARDS ARROW}", "down": "\N{DOWNWARDS ARROW}", "left": "\N{LEFTWARDS ARROW}"}
 _ARROWS["right"] = "\N{RIGHTWARDS ARROW}"
@@ -218,11 +217,11 @@ def _level_bar(ax: Axes, board: Board, palette, largest: int, units: tuple[str, 
     bar = colorbar(ax, board, mappable, "", spacing="proportional")
     ticks = np.arange(1, largest + 1, -(-largest // 8))
     numbers = [f"{tick} {units[0] if tick == 1 else units[1]}" for tick in ticks]
-    bar.set_ticks([0.5 - 1.5 * width, 0.5 - 0.5 * width, *ticks], labels=[*_NAMES, *numbers])
-    _plain(bar)
+    bar.set_ticks([0.5 - 1.5 * width, 0.5 - 0.5 * width, *ticks], labels=[*SIGNS, *numbers])
+    _without_marks(bar)
 
 
-def _plain(bar) -> None:
+def _without_marks(bar) -> None:
     """Names need no tick marks."""
     bar.minorticks_off()
     bar.ax.tick_params(length=0)
@@ -261,7 +260,7 @@ def _draw_actions(ax: Axes, board: Board, policy: np.ndarray, radius: np.ndarray
     bar = colorbar(ax, board, show(ax, board, kinds, cmap=palette, norm=scale), "")
     bar.outline.set(visible=True, edgecolor=FAINT)
     bar.set_ticks(np.arange(palette.N), labels=["no majority", *names])
-    _plain(bar)
+    _without_marks(bar)
     _draw_signs(ax, board, np.where(radius < 0, _NOTHING, 1))
     _draw_cells(ax, board)
 

@@ -19,16 +19,14 @@ from jaxhom import checks
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.names import check_names
 from jaxhom.plotting.boards import require
-from jaxhom.plotting.palette import AMOUNT, BLUE, PURPLE, VERMILLION
 from jaxhom.plotting.pictures import unpadded
+from jaxhom.plotting.style import AMOUNT, BLUE, OCCUPANCY_RANGE, PURPLE, SIGNS, VERMILLION, plain_axes
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Float, Int
 
 _NAMED = 24  # states or actions, that names have room for
 _LETTERS = 60  # of all of them side by side
-_DECADES = 4  # of an occupancy that are told apart
-_NAMES = ("\N{MULTIPLICATION SIGN} nothing found", "\N{BULLET} demonstrated")
 
 
 def plot_policy_by_state(
@@ -116,13 +114,13 @@ def plot_occupancy_by_state(
     largest = visits.max()
     if not largest > 0:
         raise ValueError(f"occupancy must be positive in some state, its largest is {largest}")
-    least = largest / 10**_DECADES
+    least = largest / OCCUPANCY_RANGE
     ax = _axes(ax, height=2.8)
     shown = np.flatnonzero(visits >= least)
     ax.vlines(shown, least, visits[shown], color=BLUE, linewidth=np.clip(240.0 / len(visits), 0.6, 4.0))
     ax.set(yscale="log", ylim=(least, 1.5 * largest), xlim=(-0.5, len(visits) - 0.5), xlabel="state", ylabel=label)
     _show_names(ax.xaxis, "state_names", state_names, len(visits), is_upright=True)
-    return _plain(ax)
+    return plain_axes(ax)
 
 
 def plot_trajectories_by_state(
@@ -154,7 +152,7 @@ def plot_trajectories_by_state(
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(8, integer=True))
     _show_names(ax.yaxis, "state_names", state_names, None)
-    return _plain(ax)
+    return plain_axes(ax)
 
 
 def plot_radius_counts(radius: Int[ArrayLike, "S"], *, ax: Axes | None = None) -> Axes:
@@ -186,12 +184,12 @@ def plot_radius_counts(radius: Int[ArrayLike, "S"], *, ax: Axes | None = None) -
     ax = _axes(ax, height=2.8)
     colors = [PURPLE, VERMILLION, *[BLUE] * (len(levels) - 2)]
     bars = ax.bar(levels, counts, color=colors)
-    ax.legend(bars[:3], [*_NAMES, "generalized to"], frameon=False, loc="best")
+    ax.legend(bars[:3], [*SIGNS, "generalized to"], frameon=False, loc="best")
     steps = levels[2 :: -(-len(levels) // 20)]
-    ax.set_xticks([-1, 0, *steps], labels=[*(name[0] for name in _NAMES), *map(str, steps)])
+    ax.set_xticks([-1, 0, *steps], labels=[*(name[0] for name in SIGNS), *map(str, steps)])
     ax.set(xlabel="steps to the demonstrated states that voted", ylabel="states")
     ax.yaxis.set_major_locator(MaxNLocator(6, integer=True))
-    return _plain(ax)
+    return plain_axes(ax)
 
 
 def _axes(ax: Axes | None, height: float) -> Axes:
@@ -210,10 +208,3 @@ def _show_names(
         texts = [str(name) for name in names]
         is_long = is_upright and sum(map(len, texts)) > _LETTERS
         axis.set_ticks(range(len(texts)), labels=texts, rotation=90 if is_long else 0)
-
-
-def _plain(ax: Axes) -> Axes:
-    ax.grid(axis="y", color="#E3E3E3", linewidth=0.8)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax

@@ -23,12 +23,11 @@ from jaxhom.plotting.boards import (
     policy_at,
     require,
 )
-from jaxhom.plotting.palette import INK, TINT, VERMILLION
+from jaxhom.plotting.style import INK, OCCUPANCY_RANGE, TINT, VERMILLION
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Float
 
-_DECADES = 4  # of an occupancy that are told apart
 _SPREAD = 0.4  # cells from the first to the last of several trajectories that run side by side
 
 
@@ -255,7 +254,7 @@ def plot_occupancy(
     largest = visits[board.is_open].max()
     if not largest > 0:
         raise ValueError(f"occupancy must be positive in some open cell, its largest is {largest}")
-    least = largest / 10**_DECADES
+    least = largest / OCCUPANCY_RANGE
     scale = colors.LogNorm(vmin=least, vmax=largest)
     ax = ground(board, ax, BAR_ROOM)
     heat(ax, board, np.where(visits < least, np.nan, visits), label, norm=scale)

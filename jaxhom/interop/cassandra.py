@@ -19,6 +19,7 @@ from jaxhom import checks
 from jaxhom.interop.archives import FileError, errors_of
 from jaxhom.interop.cassandra_statements import WILD, Rules, Statements, Things, number_of, start_of
 from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model_of_entries, named
+from jaxhom.models.padded_rows import rows_and_places
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float
@@ -165,7 +166,7 @@ def _mean_over_observations(statements: Statements, rules: Rules, places: np.nda
         a, _, z = places[np.argmax(wrong)]
         pair = f"action {named(actions.names, a)} and next state {named(states.names, z)}"
         raise FileError(f"{statements.path}: observations (O) of {pair} must sum to 1, got {total[row][wrong][0]:g}")
-    step = np.repeat(np.arange(len(places)), count[row])
-    entry = np.arange(len(step)) - np.repeat(np.cumsum(count[row]) - count[row], count[row]) + first[row][step]
+    step, place = rows_and_places(count[row])
+    entry = first[row][step] + place
     reward = rules.at(np.column_stack([places[step], observed[entry, 2]]), shape)
     return np.bincount(step, chance[entry] * reward, minlength=len(places)) / total[row]

@@ -28,6 +28,7 @@ from jaxhom.interop.imported_model import Entries, ImportedModel, counted, model
 from jaxhom.interop.numbering import real_of, whole_of
 from jaxhom.interop.text_files import open_text, without_gz
 from jaxhom.interop.text_tables import TextTable, numbered
+from jaxhom.models.padded_rows import rows_and_places
 
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Float
@@ -193,9 +194,7 @@ def _exits(network: _Network) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(network.begin, kind="stable")
     count = np.bincount(network.begin, minlength=len(network.nodes))
     first = np.cumsum(count) - count
-    num_exits = count[network.end]
-    link = np.repeat(np.arange(len(network.end)), num_exits)
-    place = np.arange(len(link)) - np.repeat(np.cumsum(num_exits) - num_exits, num_exits)
+    link, place = rows_and_places(count[network.end])
     exit_ = order[first[network.end[link]] + place]
     is_back = network.end[exit_] == network.begin[link]
     others = np.bincount(link[~is_back], minlength=len(network.end))

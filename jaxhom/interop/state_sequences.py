@@ -20,6 +20,7 @@ from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.inputs import as_model
 from jaxhom.models.mdp import MDP
 from jaxhom.models.names import described
+from jaxhom.models.padded_rows import rows_and_places
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -78,8 +79,7 @@ def inferred_actions(
     lengths = np.array([max(len(states) - 1, 0) for states in sequences], np.int64)
     before = np.concatenate([np.zeros(0, np.int64), *(states[:-1] for states in sequences)])
     after = np.concatenate([np.zeros(0, np.int64), *(states[1:] for states in sequences)])
-    sequence = np.repeat(np.arange(len(lengths)), lengths)
-    step = np.arange(len(before)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    sequence, step = rows_and_places(lengths)
     pairs, kind = np.unique(before * mdp.num_states + after, return_inverse=True)
     chance = _chances(mdp, *np.divmod(pairs, mdp.num_states))
 

@@ -14,6 +14,7 @@ import scipy
 
 from jaxhom import checks
 from jaxhom.models.mdp import MDP
+from jaxhom.models.padded_rows import rows_and_places
 
 
 def checked_rows(matrix: Any, exists: np.ndarray, row_name: Callable[[int], str]) -> Any:
@@ -63,8 +64,7 @@ def model_of_rows(rows: Any, num_actions: int, **options: Any) -> MDP:
     lengths = np.diff(rows.indptr)
     width = max(1, int(lengths.max()))
     checks.require_slots(num_states, num_actions, width)
-    pair = np.repeat(np.arange(len(lengths)), lengths)
-    slot = np.arange(rows.nnz) - np.repeat(rows.indptr[:-1], lengths)
+    pair, slot = rows_and_places(lengths)
     next_state = np.zeros((len(lengths), width), np.int64)
     probability = np.zeros((len(lengths), width), rows.dtype)
     next_state[pair, slot], probability[pair, slot] = rows.indices, rows.data

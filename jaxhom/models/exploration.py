@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from jaxhom import checks
 from jaxhom.models.names import Names, numbers_of
+from jaxhom.models.padded_rows import rows_and_places
 
 Successors = Callable[[Any], Mapping[Hashable, Iterable[tuple[float, Hashable]]] | None]
 
@@ -100,10 +101,10 @@ def padded(explored: Explored) -> tuple[np.ndarray, np.ndarray]:
     count = np.bincount(explored.pair, minlength=num_states * num_actions)
     width = max(1, int(count.max()))
     checks.require_slots(num_states, num_actions, width)
-    slot = np.arange(len(explored.pair)) - np.repeat(np.cumsum(count) - count, count)
+    pair, slot = rows_and_places(count)
     next_state = np.zeros((len(count), width), np.int64)
     probability = np.zeros((len(count), width))
-    next_state[explored.pair, slot], probability[explored.pair, slot] = explored.successor, explored.probability
+    next_state[pair, slot], probability[pair, slot] = explored.successor, explored.probability
     shape = (num_states, num_actions, width)
     next_state, probability = next_state.reshape(shape), probability.reshape(shape)
     next_state[explored.ends], probability[explored.ends, :, 0] = np.flatnonzero(explored.ends)[:, None, None], 1.0

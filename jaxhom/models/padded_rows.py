@@ -80,6 +80,12 @@ def pad_rows(
     return PaddedRows(narrow=narrow, wide_row=wide_row, wide=wide)
 
 
+def rows_and_places(lengths: Int[np.ndarray, " R"]) -> tuple[Int[np.ndarray, " I"], Int[np.ndarray, " I"]]:
+    """Of all items of ragged rows, one row after the other: the row of each, and its place there."""
+    row = np.repeat(np.arange(len(lengths), dtype=np.int64), lengths)
+    return row, np.arange(len(row)) - (np.cumsum(lengths) - lengths)[row]
+
+
 def narrow_width(counts: Int[np.ndarray, " R"]) -> int:
     """Width that minimises the items read per sweep, all rows to the width and long rows to the end."""
     longest = int(counts.max())

@@ -18,6 +18,7 @@ from jaxhom import checks
 from jaxhom.models.graph import HostGraph, host_graph
 from jaxhom.models.inputs import check_states
 from jaxhom.models.mdp import MDP
+from jaxhom.models.padded_rows import rows_and_places
 from jaxhom.status import Record
 
 _MAX_ENTRIES = 2**24  # of a transition tensor: 128 MB in float64
@@ -202,11 +203,9 @@ def _numbered(states, rows: scipy.sparse.csr_array, width: int):
     `position(model, state, otherwise)` looks up numbers of states in models, `otherwise` where a state is no member.
     """
     count, num_states = rows.shape
-    sizes = np.diff(rows.indptr)
-    model = np.repeat(np.arange(count, dtype=np.int64), sizes)
+    model, place = rows_and_places(np.diff(rows.indptr))
     key = model * num_states + rows.indices  # ascending: rows are sorted
     is_centre = rows.indices == states[model]
-    place = np.arange(len(key)) - np.repeat(rows.indptr[:-1], sizes)
     centre_place = place[is_centre][model]
     local = np.where(is_centre, 0, place + (place < centre_place))
     members = np.full((count, width), -1, np.int32)

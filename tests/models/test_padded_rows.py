@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxhom.models.padded_rows import gather_sum, narrow_width, pad_rows, sum_rows
+from jaxhom.models.padded_rows import gather_sum, narrow_width, pad_rows, rows_and_places, sum_rows
 
 COUNTS = {
     "all alike": [3, 3, 3, 3],
@@ -93,3 +93,10 @@ def test_sums_of_many_terms(width):
     values = rng.normal(size=(5, 2))
     total = jax.jit(gather_sum)(index, weight, values)
     np.testing.assert_allclose(total, np.einsum("ijn,ijnb->ijb", weight, values[index]), rtol=0, atol=1e-12)
+
+
+def test_rows_and_places_of_ragged_rows():
+    row, place = rows_and_places(np.array([2, 0, 3, 1, 0]))
+    np.testing.assert_array_equal(row, [0, 0, 2, 2, 2, 3])
+    np.testing.assert_array_equal(place, [0, 1, 0, 1, 2, 0])
+    assert all(len(array) == 0 for array in rows_and_places(np.zeros(0, int)))

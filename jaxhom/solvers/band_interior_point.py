@@ -16,19 +16,22 @@ import jax
 import jax.numpy as jnp
 
 from jaxhom.solvers.band_system import BandSystem, Factor
+from jaxhom.solvers.normal_equations import ACCURATE, REFINEMENTS
+from jaxhom.solvers.predictor_corrector import (
+    EVEN,
+    LONGER,
+    MOST_CORRECTORS,
+    PATIENCE,
+    TO_BOUNDARY,
+    WORTH_IT,
+    longest_step,
+    mehrotra_target,
+    towards_centre,
+)
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Bool, Float, Int
-
-PATIENCE = 30  # steps without a smaller error, after which rounding has won
-_TO_BOUNDARY = 0.995  # of the way: points stay positive
-_CORRECTORS = 3  # after Mehrotra's, at most
-_LONGER = 0.3  # what a corrector aims to add to the step
-_SOME = 0.03  # what it has to add to be kept
-_EVEN = 0.1  # products between this share of the target and its inverse stay as they are
-_REFINEMENTS = 2  # of a solve, at most
-_ACCURATE = 1e-8  # share of the right-hand side that may be missing
 
 
 class Lanes(Record):
@@ -180,7 +183,7 @@ def _step(system: BandSystem, state: Iterate, is_open: Bool[Array, " L"]) -> Poi
 
     def keep_going(carry):
         turn, active = carry[0], carry[-1]
-        return (turn < 2) | ((turn < 2 + _CORRECTORS) & active.any())
+        return (turn < 2) | ((turn < 2 + MOST_CORRECTORS) & active.any())
 
     def correct(carry):
         turn, change, along, across, target, active = carry
@@ -192,18 +195,17 @@ def _step(system: BandSystem, state: Iterate, is_open: Bool[Array, " L"]) -> Poi
         new = _direction(system, factor, point, wanted, jnp.where(is_further, aimed, mehrotra), active)
         new = jax.tree.map(lambda old, new: jnp.where(is_further, old, 0.0) + new, change, new)
         new_along, new_across = _length(z, new.z), _length(s, new.s)
-        is_longer = active & (new_along + new_across >= along + across + _SOME)
+        is_longer = active & (new_along + new_across >= along + across + WORTH_IT)
         taken = jnp.where(is_further, is_longer, True)
         change, along, across = _selected(taken, (new, new_along, new_across), (change, along, across))
         left = _dot(z + along[:, None] * change.z, s + across[:, None] * change.s) / product
-        target = jnp.where(is_predictor, mean * jnp.maximum(left, 0.0) ** 3, target)
+        target = jnp.where(is_predictor, mehrotra_target(mean, left, most=jnp.inf), target)
         return turn + 1, change, along, across, target, active & (taken | ~is_further)
 
     none = jnp.zeros_like(mean)
     start = (0, jax.tree.map(jnp.zeros_like, point), none, none, none, is_open)
     _, change, along, across, _, _ = jax.lax.while_loop(keep_going, correct, start)
-    along, across = _shortened(z, change.z), _shortened(s, change.s)
-    along, across = along[:, None], across[:, None]
+    along, across = (_length(*pair, TO_BOUNDARY)[:, None] for pair in ((z, change.z), (s, change.s)))
     return Point(
         z=z + along * change.z,
         s=s + across * change.s,
@@ -215,24 +217,13 @@ def _step(system: BandSystem, state: Iterate, is_open: Bool[Array, " L"]) -> Poi
 
 def _aimed(point: Point, change: Point, along, across, target):
     """Gondzio: what products lack, after a longer step, to be near the target."""
-    along, across = (jnp.minimum(1.0, length + _LONGER)[:, None] for length in (along, across))
-    products = (point.z + along * change.z) * (point.s + across * change.s)
-    low, high = _EVEN * target, target / _EVEN
-    return jnp.maximum(jnp.clip(products, low, high) - products, -high)
+    along, across = (jnp.minimum(1.0, length + LONGER)[:, None] for length in (along, across))
+    return towards_centre((point.z + along * change.z) * (point.s + across * change.s), target, EVEN)
 
 
-def _boundary(value, change):
-    """The step at which the first value is 0; infinite if none falls."""
-    is_falling = change < 0
-    return jnp.where(is_falling, -value / jnp.where(is_falling, change, -1.0), jnp.inf).min(axis=1)
-
-
-def _length(value, change):
-    return jnp.minimum(_boundary(value, change), 1.0)
-
-
-def _shortened(value, change):
-    return jnp.minimum(_TO_BOUNDARY * _boundary(value, change), 1.0)
+def _length(value, change, to_boundary: float = 1.0):
+    """`longest_step` of each lane."""
+    return jax.vmap(lambda value, change: longest_step((value, change), to_boundary=to_boundary))(value, change)
 
 
 def _direction(system: BandSystem, factor: Factor, point: Point, residuals: Residuals, products, is_open) -> Point:
@@ -247,11 +238,11 @@ def _direction(system: BandSystem, factor: Factor, point: Point, residuals: Resi
 
 def _refined(system: BandSystem, factor: Factor, d, right, is_open):
     """The solution with iterative refinement: as d spreads, the factorisation alone loses digits."""
-    accurate = _ACCURATE * _largest(right)
+    accurate = ACCURATE * _largest(right)
 
     def keep_going(carry):
         turn, _, missing = carry
-        return (turn == 0) | ((turn <= _REFINEMENTS) & (is_open & (_largest(missing) > accurate)).any())
+        return (turn == 0) | ((turn <= REFINEMENTS) & (is_open & (_largest(missing) > accurate)).any())
 
     def refine(carry):
         turn, found, missing = carry

@@ -24,12 +24,12 @@ import scipy
 from jaxhom import checks
 from jaxhom.solvers.block_tridiagonal import Blocks, order_in_blocks
 from jaxhom.solvers.inverse_factor import inverse_factor_in_loops
+from jaxhom.solvers.normal_equations import REGULARISATION
 from jaxhom.status import Record
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float, Int
 
-_REGULARISATION = 1e-14  # share of each diagonal entry of what is factorised
 _UNIT = 16  # sizes of blocks are multiples of it
 _MIN_BLOCK = 32  # smaller ones are more steps, not less work
 _BUCKETS = 3  # of rows by their lengths: a row of the largest grids' matrices is 1 to 30 terms long
@@ -214,7 +214,7 @@ def _apply_transposed(matrix, vector):
 
 
 def _regular(matrix):
-    return matrix * (1.0 + _REGULARISATION * jnp.eye(matrix.shape[-1]))
+    return matrix * (1.0 + REGULARISATION * jnp.eye(matrix.shape[-1]))
 
 
 def band_system(

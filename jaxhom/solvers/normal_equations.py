@@ -21,9 +21,9 @@ from jaxhom.solvers.block_tridiagonal import BlockCholesky, order_in_blocks
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_REGULARISATION = 1e-14  # share of each diagonal entry of what is factorised
-_REFINEMENTS = 2  # per solve, at most: as d spreads, the factorisation alone loses digits
-_ACCURATE = 1e-8  # share of the right-hand side that may be missing
+REGULARISATION = 1e-14  # share of each diagonal entry of what is factorised
+REFINEMENTS = 2  # per solve, at most: as d spreads, the factorisation alone loses digits
+ACCURATE = 1e-8  # share of the right-hand side that may be missing
 _MIN_BLOCK = 32  # smaller ones are more calls, not less work
 _DENSE = 0.2  # share of entries from which on dense products are taken to be faster
 
@@ -65,10 +65,10 @@ class Rows:
         """(y, f), with iterative refinement."""
         y, f = self._solve_once(right, free_right)
         scale = np.abs(right).max(initial=np.abs(free_right).max(initial=0.0))
-        for _ in range(_REFINEMENTS):
+        for _ in range(REFINEMENTS):
             missing = right - self.matrix @ (self._d * (self.transpose @ y)) - self.free_columns @ f
             free_missing = free_right - self.free_columns.T @ y
-            if max(np.abs(missing).max(), np.abs(free_missing).max(initial=0.0)) <= _ACCURATE * scale:
+            if max(np.abs(missing).max(), np.abs(free_missing).max(initial=0.0)) <= ACCURATE * scale:
                 break
             more_y, more_f = self._solve_once(missing, free_missing)
             y, f = y + more_y, f + more_f
@@ -95,7 +95,7 @@ class _Before:
         scaled = self._core * d
         self._cross, self._diagonal = scaled @ self._others_transpose, self._square @ d
         schur = scaled @ self._core_transpose - (self._cross / self._diagonal) @ self._cross.T
-        self._factor = BlockCholesky(schur, self._blocks, _REGULARISATION)
+        self._factor = BlockCholesky(schur, self._blocks, REGULARISATION)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         num_core = len(self._blocks.order)
@@ -118,11 +118,11 @@ class _After:
 
     def factor(self, d: np.ndarray) -> None:
         scaled = self._core * d
-        self._factor = BlockCholesky(scaled @ self._core_transpose, self._blocks, _REGULARISATION)
+        self._factor = BlockCholesky(scaled @ self._core_transpose, self._blocks, REGULARISATION)
         half = self._factor.solve_lower(_dense(scaled @ self._others_transpose))
         self._half = half.reshape(-1, half.shape[-1])
         corner = _dense((self._others * d) @ self._others_transpose) - self._half.T @ self._half
-        corner[np.diag_indices_from(corner)] *= 1.0 + _REGULARISATION
+        corner[np.diag_indices_from(corner)] *= 1.0 + REGULARISATION
         self._corner = scipy.linalg.cho_factor(corner, lower=True, overwrite_a=True, check_finite=False)
 
     def solve(self, right: np.ndarray) -> np.ndarray:

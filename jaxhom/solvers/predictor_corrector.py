@@ -7,8 +7,8 @@ adds correctors that pull together the products that would end far apart.
 
 What a step solves differs from method to method and stays with it. Arrays of NumPy and of JAX both work: on the host
 the products are few and a call into JAX would take longer than all of them, inside a program NumPy cannot be. The
-methods for single problems use this (`game_interior_point`, `sparse_interior_point`); the one of the similarity has its
-lanes last and its steps in a loop that is compiled once, and has these rules per lane.
+methods for single problems use this (`game_interior_point`, `sparse_interior_point`), and lane by lane so does that of
+bands (`band_interior_point`); the one of the similarity has its lanes last, and these rules for itself.
 """
 
 from __future__ import annotations
@@ -20,6 +20,14 @@ from jaxhom.solvers.arrays import module_of
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
+
+# Of programs over occupancies, on the host and in programs alike.
+TO_BOUNDARY = 0.995  # of the way: points stay positive
+PATIENCE = 30  # steps without a smaller error, after which rounding has won
+MOST_CORRECTORS = 3  # after Mehrotra's
+LONGER = 0.3  # what a corrector aims to add to the step
+WORTH_IT = 0.03  # what it has to add, to both lengths together, to be kept
+EVEN = 0.1  # products between this share of the target and its inverse stay as they are
 
 
 def longest_step(

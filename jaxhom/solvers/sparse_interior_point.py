@@ -16,18 +16,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxhom.solvers.normal_equations import Rows
-from jaxhom.solvers.predictor_corrector import longest_step, mehrotra_target, towards_centre
+from jaxhom.solvers.predictor_corrector import (
+    EVEN,
+    LONGER,
+    MOST_CORRECTORS,
+    PATIENCE,
+    TO_BOUNDARY,
+    WORTH_IT,
+    longest_step,
+    mehrotra_target,
+    towards_centre,
+)
 from jaxhom.status import Record, Status
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-_TO_BOUNDARY = 0.995  # of the way: points stay positive
-_PATIENCE = 30  # steps without a smaller error, after which rounding has won
-_CORRECTORS = 3  # after Mehrotra's, at most
-_LONGER = 0.3  # what a corrector aims to add to the step
-_SOME = 0.03  # what it has to add to be kept
-_EVEN = 0.1  # products between this share of the target and its inverse stay as they are
 
 
 class InteriorPoint(Record):
@@ -86,7 +89,7 @@ def solve(
             if best.error <= tolerance:
                 status = Status.SOLVED
                 break
-            if taken - best.iterations >= _PATIENCE or not np.isfinite(point.error):
+            if taken - best.iterations >= PATIENCE or not np.isfinite(point.error):
                 break
             if taken == max_iterations:
                 status = Status.ITERATION_LIMIT
@@ -158,15 +161,15 @@ def _step(rows: Rows, residuals, point: InteriorPoint) -> InteriorPoint:
     target = mehrotra_target((z @ s) / len(z), left, most=np.inf)
     change = direction(target - z * s - change.z * change.s, residuals)
     along, across = change.lengths(point)
-    for _ in range(_CORRECTORS):
-        further_along, further_across = min(1.0, along + _LONGER), min(1.0, across + _LONGER)
+    for _ in range(MOST_CORRECTORS):
+        further_along, further_across = min(1.0, along + LONGER), min(1.0, across + LONGER)
         products = (z + further_along * change.z) * (s + further_across * change.s)
-        corrected = change.corrected(direction(towards_centre(products, target, _EVEN), nothing))
+        corrected = change.corrected(direction(towards_centre(products, target, EVEN), nothing))
         longer_along, longer_across = corrected.lengths(point)
-        if longer_along + longer_across < along + across + _SOME:
+        if longer_along + longer_across < along + across + WORTH_IT:
             break
         change, along, across = corrected, longer_along, longer_across
-    along, across = change.lengths(point, _TO_BOUNDARY)
+    along, across = change.lengths(point, TO_BOUNDARY)
     return point.replace(
         z=z + along * change.z, f=point.f + along * change.f, y=point.y + across * change.y, s=s + across * change.s
     )

@@ -19,11 +19,11 @@ from jaxhom.programs import host_jit
 from jaxhom.similarity.homomorphism_lp import HomomorphismProblem
 from jaxhom.similarity.newton import factorise
 from jaxhom.solvers.lane_queue import Solver, is_settled, run_lanes
+from jaxhom.solvers.predictor_corrector import EVEN, towards_centre
 
 MAX_ITERATIONS = 60  # ten are usual
 _TO_BOUNDARY = 0.99  # of the way: points stay positive
 _CORRECTORS = 2  # after Mehrotra's, at most
-_CENTRED = (0.1, 10.0)  # products y s within these multiples of mu are left alone
 
 
 @chex.dataclass(frozen=True)
@@ -99,7 +99,7 @@ def step(problem: HomomorphismProblem, state: InteriorPointState) -> InteriorPoi
         second_order = (ds * dy for ds, dy in zip(*move[:2], strict=True))
         corrected = (mu - term for term in second_order)
         trial = products(move, tuple(jnp.minimum(1.0, 1.5 * length + 0.1) for length in steps))
-        centred = (goal + _towards_centre(value, mu) for goal, value in zip(goals, trial, strict=True))
+        centred = (goal + towards_centre(value, mu, EVEN) for goal, value in zip(goals, trial, strict=True))
         goals = tuple(
             jnp.where(mask & (k > 0), jnp.where(k == 1, one, other), 0.0)
             for mask, one, other in zip(masks, corrected, centred, strict=True)
@@ -151,12 +151,6 @@ def _update_bounds(problem: HomomorphismProblem, state: InteriorPointState) -> I
     y = state.plus - state.minus
     lower, upper = problem.bounds(state.f, y, problem.forward(state.f), problem.adjoint(y))
     return state.replace(lower=jnp.maximum(state.lower, lower), upper=jnp.minimum(state.upper, upper))
-
-
-def _towards_centre(value: jax.Array, mu: jax.Array) -> jax.Array:
-    """What a product y s lacks to be within `_CENTRED` of mu; large ones are not corrected by more than that."""
-    low, high = (factor * mu for factor in _CENTRED)
-    return jnp.maximum(jnp.clip(value, low, high) - value, -high)
 
 
 def _follow(state: InteriorPointState, move, steps) -> InteriorPointState:

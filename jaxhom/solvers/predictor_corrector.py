@@ -8,7 +8,7 @@ adds correctors that pull together the products that would end far apart.
 What a step solves differs from method to method and stays with it. Arrays of NumPy and of JAX both work: on the host
 the products are few and a call into JAX would take longer than all of them, inside a program NumPy cannot be. The
 methods for single problems use this (`game_interior_point`, `sparse_interior_point`), and lane by lane so does that of
-bands (`band_interior_point`); the one of the similarity has its lanes last, and these rules for itself.
+bands (`band_interior_point`). The one of the similarity has its lanes last and, but for the centre, rules for itself.
 """
 
 from __future__ import annotations

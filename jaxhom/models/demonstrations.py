@@ -186,6 +186,7 @@ class Demonstrations(Record):
 
     def _require_shapes(self) -> None:
         shape = self.states.shape
+        checks.require_shape("states", self.states, "[..., H] with H >= 1", self.states.ndim > 0 and shape[-1] > 0)
         same = self.actions.shape == shape and self.mask.shape == shape
         checks.require_shape("states, actions and mask", self.actions, f"{shape} alike", same)
         for name in ("terminated", "final_states", "is_answer"):
@@ -312,7 +313,7 @@ def monte_carlo_feature_expectations(mdp: MDP, demonstrations: Demonstrations) -
     mdp = as_model(mdp)
     require_demonstrations(demonstrations).validate(mdp, "warn")
     if not checks.is_traced(demonstrations.is_answer) and np.asarray(demonstrations.is_answer).all():
-        raise ValueError("all trajectories are answers about single states, which say nothing of time")
+        raise ValueError("there are no trajectories but answers about single states, which say nothing of time")
     is_little = checks.is_at_hand(mdp, demonstrations)  # the sums take less time than any program compiles
     expectations, is_lost = (_expected_at_hand if is_little else _expectations)(mdp, demonstrations)
     if not checks.is_traced(is_lost):

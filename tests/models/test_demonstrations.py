@@ -130,6 +130,14 @@ def test_fields_of_different_shapes_are_refused():
         broken.validate(small_models.case("dense").mdp)
 
 
+@pytest.mark.parametrize("use", [empirical_policy, monte_carlo_feature_expectations])
+def test_no_steps_at_all_are_refused(use):
+    given = Demonstrations.from_trajectories(RAGGED)
+    none = given.replace(states=given.states[:, :0], actions=given.actions[:, :0], mask=given.mask[:, :0])
+    with pytest.raises(ValueError, match=r"states must have shape \[..., H\] with H >= 1, got \(3, 0\)"):
+        use(small_models.case("dense").mdp, none)
+
+
 def test_padding_is_not_validated():
     demonstrations = Demonstrations.from_trajectories(RAGGED)
     junk = demonstrations.replace(states=jnp.where(demonstrations.mask, demonstrations.states, 99))

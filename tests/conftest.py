@@ -20,7 +20,13 @@ import small_models
 
 from jaxhom.programs import folder_for_programs
 
-_MUCH = 1.3e9  # bytes of a process from which on it gives memory back
+_MUCH = 3e9  # bytes of a process from which on it gives memory back; then it compiles again what it had compiled
+_FEWER_PASSES = (
+    "--xla_backend_optimization_level=0",
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",  # the other processor has tests of its own
+    "--xla_llvm_force_inline_before_split=false",
+)
 
 jax.config.update("jax_enable_x64", True)
 
@@ -32,7 +38,7 @@ if not os.environ.get("JAXHOM_TESTS_AS_USERS"):
         jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jaxlib.__version__.startswith("0.10."):  # an XLA that does not know a flag aborts
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+        os.environ.setdefault("XLA_FLAGS", " ".join(_FEWER_PASSES))
 
 
 @pytest.fixture(params=small_models.NAMES)

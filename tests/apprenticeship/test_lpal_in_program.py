@@ -169,7 +169,7 @@ def test_models_of_their_own_under_vmap(rng):
 
 
 @pytest.mark.parametrize(
-    "parameters", [("expectations",), ("features", "initial"), ("probability", "discount")], ids=" and ".join
+    "parameters", [("expectations",), ("features", "initial", "probability", "discount")], ids=", ".join
 )
 def test_derivatives_are_those_outside(parameters, rng):
     """Which are held to finite differences of HiGHS in their own tests."""

@@ -56,3 +56,15 @@ def test_is_traced_sees_one_traced_leaf():
     jax.jit(lambda x: seen.append(checks.is_traced({"a": np.ones(2)}, (x, 3))))(1.0)
     assert seen == [True]
     assert not checks.is_traced({"a": np.ones(2)}, 1.0)
+
+
+def test_what_is_below_zero_by_rounding_is_zero():
+    rows = checks.require_distribution("rows", np.array([[1 - 0.9 - 0.1, 0.9, 0.1], [0.0, 0.5, 0.5]]))
+    np.testing.assert_array_equal(rows[0, 0], 0.0)
+    np.testing.assert_allclose(rows.sum(axis=1), 1.0, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match=r"rows\[0\] must not be negative"):
+        checks.require_distribution("rows", np.array([-1e-9, 1.0]))
+
+
+def test_thirds_in_float16_are_a_distribution():
+    np.testing.assert_allclose(checks.require_distribution("row", np.full(3, 1 / 3, np.float16)).sum(), 1.0, atol=1e-3)

@@ -132,7 +132,7 @@ def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
       float [K] in JAX's default type, the w of the reward sum_i w_i phi_i; not normalised.
 
     Raises:
-      ValueError: if `num_regions` is below 1.
+      ValueError: if `num_regions` is below 1, or `key` is none.
 
     Example:
       >>> weights = sample_weights(jax.random.key(0), 64)
@@ -141,6 +141,7 @@ def sample_weights(key: Key[Array, ""], num_regions: int) -> Float[Array, " K"]:
 
     Source: Boularias and Chaib-draa 2010, section VI.A.
     """
+    checks.require_key(key)
     num_regions = checks.require_count("num_regions", num_regions)
     return (_weights_at_hand if checks.is_at_hand(key) else _weights)(key, num_regions)
 

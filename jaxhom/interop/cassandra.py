@@ -121,7 +121,9 @@ def _require_all_rows(path, action: np.ndarray, state: np.ndarray, actions: Thin
     if not is_set.all():
         s, a = np.argwhere(~is_set)[0]
         pair = f"action {named(actions.names, a)} in state {named(states.names, s)}"
-        raise FileError(f"{path}: no probabilities (T) of {pair}, nor of {counted((~is_set).sum() - 1, 'other pair')}")
+        others = int((~is_set).sum()) - 1
+        more = f", nor of {counted(others, 'other pair')}" if others else ""
+        raise FileError(f"{path}: no probabilities (T) of {pair}{more}")
 
 
 def _rewards(statements: Statements, rules: Rules, places: np.ndarray, axes, remarks: list[str]) -> np.ndarray | None:

@@ -30,6 +30,7 @@ Rule = tuple[np.ndarray, np.ndarray, np.ndarray]  # fields, values and times, of
 
 WILD = -1  # the number of `*`
 _CHUNK = 100_000  # statements that are split at once
+_KNOWN = "discount, values, states, actions, observations, start, T, O, R"
 _COMMENT = re.compile(r"#[^\n]*")
 _HEAD = re.compile(
     r"(?:^[ \t]*|(?<=[^\s:])[ \t]+)"  # behind a colon such a word is a name
@@ -67,7 +68,14 @@ class Statements:
         found = sorted(n for other, ns in self.numbers.items() if other.split()[0] == word for n in ns)
         if len(found) > 1:
             raise self.error(found[1], f"it stands on line {self.line(found[0])} already")
-        return (found[0], self.bodies[found[0]].split()) if found else None
+        if not found:
+            return None
+        number, body = found[0], self.bodies[found[0]]
+        before, colon, _ = body.partition(":")
+        if colon:  # of a statement that is not known, which was taken for more of this one
+            line, name = self.line(number) + before.count("\n"), before.splitlines()[-1].strip() if before else ""
+            raise FileError(f"{self.path} line {line}: no statement {name!r} is known; those that are: {_KNOWN}")
+        return number, body.split()
 
     def last_word(self, number: int) -> str:
         """`exclude` of `start exclude`."""

@@ -67,9 +67,13 @@ def read_table(path: str | os.PathLike, columns: Mapping[str, str] | None = None
       FileError: if it is missing, no text, or no table, naming the line.
     """
     with open_text(path, newline="") as file:
+        blank = []
         first = file.readline()
+        while first and not first.strip():
+            blank.append(first)
+            first = file.readline()
         delimiter = _delimiter(first, set(map(plain, (columns or {}).values())))
-        rows = _rows(path, itertools.chain([first] if first else [], file), delimiter)
+        rows = _rows(path, itertools.chain(blank, [first] if first else [], file), delimiter)
         _, header = next(rows, (1, []))
         if header and header[0].startswith("#"):  # as `numpy.savetxt` marks it
             header[0] = header[0][1:]
@@ -88,7 +92,7 @@ def _rows(path: str | os.PathLike, file: Iterable[str], delimiter: str | None) -
     reader = csv.reader(file, delimiter=delimiter, strict=True)
     try:
         for row in reader:
-            if row:
+            if len(row) > 1 or (row and row[0].strip()):
                 yield reader.line_num, row
     except csv.Error as error:
         raise FileError(f"{path} line {reader.line_num}: {error}") from None

@@ -123,6 +123,8 @@ def _transitions(path: str) -> tuple[TextTable, bool, int]:
     rows.require_width(4 - is_chain, 5 - is_chain, expected)
     if num_rows is not None and len(rows) != num_rows:
         raise FileError(f"{path}: {len(rows)} transitions, but its first line says {num_rows}")
+    if not len(rows) and num_states == _UNKNOWN:
+        raise FileError(f"{path}: it has no transitions, and does not say how many states there are")
     return rows, is_chain, num_states
 
 
@@ -198,7 +200,10 @@ def _labels(base: str, num_states: int) -> dict[str, np.ndarray]:
 
 
 def _reward(base: str, entries: Entries, num_states: int, is_chain: bool, remarks: list[str]) -> np.ndarray | None:
-    """float [N], one per transition; of the first structure where there are several. None without files."""
+    """float [N], one per transition; of the first structure where there are several. None without files.
+
+    Lines about the same state or transition add up.
+    """
     name = next((n for n in (base, f"{base}1") if _part(n, ".srew") or _part(n, ".trew")), None)
     if name is None:
         return None
@@ -208,7 +213,7 @@ def _reward(base: str, entries: Entries, num_states: int, is_chain: bool, remark
     if (path := _part(name, ".srew")) is not None:
         table = _rewards(path, 2, num_states, "`state reward`")
         by_state = np.zeros(num_states)
-        by_state[table.whole_numbers(0, "state", num_states)] = table.numbers(1, "reward")
+        np.add.at(by_state, table.whole_numbers(0, "state", num_states), table.numbers(1, "reward"))
         reward += by_state[entries.state]
     if (path := _part(name, ".trew")) is not None:
         width = 4 - is_chain
@@ -229,10 +234,12 @@ def _rows(columns: Sequence[np.ndarray]) -> Iterator[tuple[int, ...]]:
 
 
 def _rewards(path: str, width: int, num_states: int, expected: str) -> TextTable:
-    """The rows of a file of rewards behind its header, which begins with the number of states."""
+    """The rows of a file of rewards behind its header: the number of states, and perhaps, last, that of the rows."""
     table = TextTable.of_words(path)
     if not len(table) or table.row(0)[0] != str(num_states):
         raise FileError(f"{path}: the first line must begin with the number of states, {num_states}")
-    rows = table.after(1)
+    header, rows = table.row(0), table.after(1)
+    if len(header) > 1 and header[-1] != str(len(rows)):
+        raise FileError(f"{path}: {len(rows)} rewards, but its first line says {header[-1]}")
     rows.require_width(width, width, expected)
     return rows

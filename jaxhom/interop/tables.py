@@ -84,7 +84,8 @@ def _of_file(path: str | os.PathLike, discount, columns: dict[str, Hashable]) ->
     header = [*map(str.strip, table.row(0))]
     table.require_width(len(header), len(header), f"{len(header)} fields, as many as the first line has")
     if all(map(_is_whole, header)):
-        cells = [table.whole_numbers(n, f"column {n + 1}", lower=-1) for n in range(len(header))]
+        count = len(table)
+        cells = [table.whole_numbers(n, f"column {n + 1}", upper=count, lower=-1) for n in range(len(header))]
         return _of_next_states(np.stack(cells, axis=1), discount)
     places, rows = _places(header, columns), table.after(1)
 
@@ -113,6 +114,14 @@ def _whole(text: str) -> int:
         if number is None or abs(number) >= _TOO_LARGE:
             raise
         return number
+
+
+def _text_of_number(value: Hashable) -> str:
+    """What a value is called beside whole numbers."""
+    try:
+        return str(_whole(str(value)))
+    except (ValueError, OverflowError):
+        return str(value)
 
 
 def _is_whole(text: str) -> bool:
@@ -202,12 +211,16 @@ def _of_columns(
 
 
 def _codes(*columns: np.ndarray | list[Hashable]) -> tuple[list, list[np.ndarray]]:
-    """The different values of columns, ascending, and each column by their numbers."""
+    """The different values of columns, ascending, and each column by their numbers.
+
+    Where one column is of whole numbers and another is not, 02 and 2.0 there are the number 2 of the first.
+    """
     whole = [column for column in columns if isinstance(column, np.ndarray)]
     if len(whole) == len(columns):
         different, code = np.unique(np.concatenate(whole), return_inverse=True)
         return different.tolist(), np.split(code, np.cumsum([len(column) for column in whole])[:-1])
-    texts = [[str(value) for value in column] for column in columns]
+    text_of = _text_of_number if whole else str
+    texts = [[text_of(value) for value in column] for column in columns]
     names = sorted({text for column in texts for text in column})
     number = {name: n for n, name in enumerate(names)}
     return names, [np.array([*map(number.__getitem__, column)], int) for column in texts]

@@ -52,7 +52,7 @@ class TextTable:
         """
         with open_text(path, newline="") as file:
             text = file.read()
-        plain = text.splitlines()
+        plain = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
         kept = [number for number, line in enumerate(plain, start=1) if not _is_left_out(line, comments)]
         separator = max(",;\t", key=plain[kept[0] - 1].count) if kept else ","
         if '"' in text:
@@ -102,7 +102,7 @@ class TextTable:
         return numbers
 
     def _numbers(self, place: int, name: str, kind: type[int] | type[float], what: str) -> np.ndarray:
-        texts = self.columns[place] if self.columns else []
+        texts = self.columns[place] if len(self) else []
         try:
             if any("_" in text for text in texts):  # which Python takes for nothing
                 raise ValueError
@@ -155,7 +155,7 @@ def _quoted(path: str | os.PathLike, text: str, separator: str, comments: str) -
     lines, rows = [], []
     try:
         for row in reader:
-            if any(row) and not (row[0] and _is_left_out(row[0], comments)):
+            if any(map(str.strip, row)) and not (row[0].strip() and _is_left_out(row[0], comments)):
                 lines.append(reader.line_num)
                 rows.append(row)
     except csv.Error as error:

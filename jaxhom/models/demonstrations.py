@@ -149,6 +149,10 @@ class Demonstrations(Record):
         try:
             index = operator.index(index)
         except TypeError:
+            if isinstance(index, str):
+                raise TypeError(f"trajectories have numbers, got the index {index!r}") from None
+            if isinstance(index, list):
+                index = checks.require_integers("index", np.asarray(index, None if index else int))
             return jax.tree.map(operator.itemgetter(index), self)
         mask, final = np.asarray(self.mask)[index], np.asarray(self.final_states)[index]
         states, actions = (np.asarray(array)[index][mask] for array in (self.states, self.actions))
@@ -367,8 +371,8 @@ def sample_demonstrations(
       where each was after its last step; without, there is no padding and final states are not kept.
 
     Raises:
-      ValueError: if `policy` has another shape or is none, a count is below 1, or `terminal` is not bool [S] or True
-        where episodes start.
+      ValueError: if `key` is none, `policy` has another shape or is none, a count is below 1, or `terminal` is not
+        bool [S] or True where episodes start.
 
     Example:
       >>> ring = MDP.from_successors([[[1]], [[2]], [[2]]], [[[1.0]]] * 3, discount=0.9, initial=[1, 0, 0])
@@ -376,6 +380,7 @@ def sample_demonstrations(
       >>> walks.states.tolist(), walks.mask.tolist(), walks.terminated.tolist()
       ([[0, 1, 0, 0]], [[True, True, False, False]], [True])
     """
+    checks.require_key(key)
     mdp = as_model(mdp)
     policy = check_policy(mdp, policy, batch=False)
     num_trajectories = checks.require_count("num_trajectories", num_trajectories)

@@ -150,10 +150,10 @@ def check_reward_values(
         host = checks.as_host_array("reward", reward)
         with_actions = host.shape[-2:] == (mdp.num_states, mdp.num_actions)
         if mdp.restricts_actions and with_actions and not checks.is_traced(mdp.allowed):
-            host = np.where(np.asarray(mdp.allowed), host, 0)
+            host = np.where(np.asarray(mdp.allowed), host, np.zeros_like(host))
         minus = (host == -np.inf) if may_forbid and host.dtype.kind == "f" else np.zeros(host.shape, bool)
         axes = _axes(mdp, host.ndim) if with_actions else ()
-        finite = checks.require_floats_in(mdp.dtype, "reward", np.where(minus, 0, host), axes)
+        finite = checks.require_floats_in(mdp.dtype, "reward", np.where(minus, np.zeros_like(host), host), axes)
         reward = np.where(minus, -np.inf, finite).astype(mdp.dtype)
     if mdp.restricts_actions and reward.shape[-2:] == (mdp.num_states, mdp.num_actions):
         xp = checks.arrays_of(mdp.allowed, reward)

@@ -210,7 +210,7 @@ def plot_trajectories(
         points[0] = board.cells[path[0]]
         y, x = np.insert(points, ends, np.nan, axis=0).T
         ax.plot(x, y, label=None if m else label, alpha=0.9, zorder=3, **style)
-    y, x = board.cells[np.unique([path[0] for path in paths])].T
+    y, x = board.cells[np.unique(np.array([path[0] for path in paths], int))].T
     ax.scatter(x, y, s=50, facecolor="white", edgecolor=color, linewidth=1.6, zorder=3.5)
     return ax
 

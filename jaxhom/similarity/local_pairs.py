@@ -68,7 +68,8 @@ def local_similarity(
       method: "pdhg"; "interior_point", for tight brackets of small models on a CPU (whatever it leaves open, PDHG
         finishes); or "auto", which chooses between them by the sizes and the tolerance, and solves few pairs in NumPy
         before a program would be compiled.
-      max_iterations: per pair, 100,000 if not given; a pair that needs more says so in `status` and keeps valid bounds.
+      max_iterations: of PDHG, per pair, 100,000 if not given; a pair that needs more says so in `status` and keeps
+        valid bounds. The interior-point method, which "auto" may take, has its own limit, which hardly any pair meets.
       progress: show a progress bar.
       table: what is known already, of the same model, labels, `distance` and `anchored`: asked first, and filled. Made
         anew if None. Inside programs it stands for the graph alone. Two models have one as a `disjoint_union`.

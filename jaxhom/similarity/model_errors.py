@@ -44,7 +44,7 @@ def homomorphism_error(
       the bounds that close. Works under `jit`, `vmap`, `grad` and `jvp`.
 
     Raises:
-      ValueError: if the shapes do not fit, or on a second derivative.
+      ValueError: if the shapes do not fit, a concrete row is no distribution and not zero, or on a second derivative.
 
     The derivative is the envelope theorem's, <y, (dT) f - f (dT')> at an optimal map f and an optimal dual y. Where
     either is not unique, e is only directionally differentiable and what is returned is the slope for the pair that
@@ -63,8 +63,7 @@ def homomorphism_error(
 
     Source: Boularias and Chaib-draa 2010, eq. (9).
     """
-    source, target = jnp.asarray(source), jnp.asarray(target)
-    checks.require_model_pair(source, target)
+    source, target = checks.require_model_pair(source, target)
     if (source_labels is None) != (target_labels is None):
         raise ValueError("source_labels and target_labels must be given together")
     labels = () if source_labels is None else _checked_labels(source, target, source_labels, target_labels)

@@ -63,8 +63,7 @@ def homomorphism_map(
 
     Source: Boularias and Chaib-draa 2010, eq. (9), regularised.
     """
-    source, target = jnp.asarray(source), jnp.asarray(target)
-    checks.require_model_pair(source, target)
+    source, target = checks.require_model_pair(source, target)
     checks.refuse_traced(regularization=regularization, anchored=anchored)
     regularization = checks.require_number("regularization", regularization)
     if not regularization > 0:

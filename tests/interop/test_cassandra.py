@@ -300,3 +300,18 @@ def test_files_that_are_none(tmp_path):
     (tmp_path / "binary.POMDP").write_bytes(bytes(range(256)))
     with pytest.raises(FileError, match="not a text file"):
         from_cassandra(tmp_path / "binary.POMDP")
+
+
+@pytest.mark.parametrize(
+    ("lines", "line", "name"),
+    [
+        (["discount: 0.9", "actions: a b", "value: cost", "states: 2", "T: * uniform"], 3, "value"),
+        (["discount: 0.9", "actions: 2", "states: 2", "Start: 0", "T: * uniform"], 4, "Start"),
+        (["discount: 0.9", "states: 2", "actions: 2", "", "Observations : 3", "T: * identity"], 5, "Observations"),
+    ],
+)
+def test_statements_that_are_not_known_are_no_names(tmp_path, lines, line, name):
+    path = tmp_path / "misspelt.POMDP"
+    path.write_text("\n".join(lines))
+    with pytest.raises(FileError, match=rf"line {line}: no statement '{name}' is known; those that are: disc"):
+        from_cassandra(path)

@@ -274,3 +274,12 @@ def test_answers_in_any_delimiter_and_by_name(tmp_path):
     assert path.read_text().splitlines()[-1] == ";1;0"
     states, actions = answers_from_csv(path, mdp=named_machine())
     assert (states.tolist(), actions.tolist()) == ([2, 1, 0], [1, 0, 1])
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_blank_lines_before_the_header_are_skipped(tmp_path, separator):
+    path = tmp_path / "steps.csv"
+    rows = [["episode", "state", "action"], ["0", "0", "1"]]
+    path.write_text("\n  \n" + "\n".join(map(separator.join, rows)))
+    demonstrations, _ = demonstrations_from_csv(path)
+    assert demonstrations.states.tolist() == [[0]] and demonstrations.actions.tolist() == [[1]]

@@ -159,3 +159,27 @@ def test_bad_files_are_refused_by_line(tmp_path, case):
 def test_missing_files(tmp_path):
     with pytest.raises(FileError, match="none.tra: no such file"):
         from_prism(tmp_path / "none", discount=0.9)
+
+
+@pytest.mark.parametrize("header", ["2 2 0", "2 0"])
+def test_a_model_without_transitions_stays_where_it_is(tmp_path, header):
+    (tmp_path / "none.tra").write_text(header + "\n")
+    found = from_prism(tmp_path / "none.tra", discount=0.9)
+    np.testing.assert_array_equal(found.mdp.transition[:, 0], np.eye(2))
+
+
+def test_no_transitions_and_no_number_of_states(tmp_path):
+    (tmp_path / "none.tra").write_text("mdp\n")
+    with pytest.raises(FileError, match="no transitions, and does not say how many states"):
+        from_prism(tmp_path / "none.tra", discount=0.9)
+
+
+@pytest.mark.parametrize(("suffix", "lines"), [(".srew", ["0 5", "0 7"]), (".trew", ["0 1 5", "0 1 7"])])
+def test_rewards_add_up_and_are_as_many_as_told(tmp_path, suffix, lines):
+    (tmp_path / "pair.tra").write_text("2 2\n0 1 1\n1 0 1\n")
+    rewards = tmp_path / f"pair{suffix}"
+    rewards.write_text("\n".join(["2 2", *lines]))
+    np.testing.assert_array_equal(from_prism(tmp_path / "pair", discount=0.9).reward, [[12.0], [0.0]])
+    rewards.write_text("\n".join(["2 9", *lines]))
+    with pytest.raises(FileError, match=rf"pair\{suffix}: 2 rewards, but its first line says 9"):
+        from_prism(tmp_path / "pair", discount=0.9)

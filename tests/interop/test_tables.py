@@ -147,8 +147,8 @@ BAD = {
     HEAD + "0,0,0,1.5,0\n0,0,1,-0.5,0\n": "probabilities of action 0 in state 0, column 1 must not be negative",
     HEAD + '0,0,"0,1,2\n': "line 2: unexpected end of data",
     "state,action,next\n0,0,0\n0,0,1\n": "probabilities of action 0 in state 0 must sum to 1, got 2.0",
-    "0,1\n0,7\n": "table[1, 1] must be below 2, got 7",
-    "0,1\n0,-2\n": "line 2: column 2 must lie in [-1, 2147483647), got '-2'",
+    "0,1\n0,7\n": "line 2: column 2 must lie in [-1, 2), got '7'",
+    "0,1\n0,-2\n": "line 2: column 2 must lie in [-1, 2), got '-2'",
 }
 
 
@@ -184,3 +184,45 @@ def test_bad_files_are_refused_by_line(tmp_path, text):
 def test_bad_tables_are_refused(table, columns, message):
     with pytest.raises(ValueError, match=message):
         from_table(table, discount=0.9, columns=columns)
+
+
+@pytest.mark.parametrize(
+    ("rows", "names"),
+    [
+        (["01,go,02", "02,go,goal"], ("1", "2", "goal")),
+        (["1.0,go,2.0", "2.0,go,goal"], ("1", "2", "goal")),
+        (["a,go,02", "02,go,a"], ("02", "a")),  # neither column is of numbers
+    ],
+)
+def test_a_number_is_the_same_state_however_it_is_written(tmp_path, rows, names):
+    path = tmp_path / "chain.csv"
+    path.write_text("\n".join(["state,action,next", *rows]))
+    found = from_table(path, discount=0.9)
+    assert found.state_names == names
+    reached = np.asarray(found.mdp.transition)[:, 0].argmax(axis=1)
+    assert [names[n] for n in reached] == [*names[1:], names[-1] if len(names) == 3 else names[0]]
+
+
+def test_a_number_is_the_same_state_in_a_frame():
+    frame = {"state": [1.0, 2.0], "action": ["a", "a"], "next": ["2.0", "goal"]}
+    assert from_table(frame, discount=0.9).state_names == ("1", "2", "goal")
+
+
+def test_a_blank_first_field_beside_quotes_is_a_field(tmp_path):
+    path = tmp_path / "noted.csv"
+    path.write_text('note,state,action,next\n"x, y",0,a,1\n ,1,a,0\n')
+    transition = from_table(path, discount=0.9).mdp.transition
+    np.testing.assert_array_equal(transition, [[[0.0, 1.0]], [[1.0, 0.0]]])
+
+
+def test_only_line_ends_end_lines(tmp_path):
+    path = tmp_path / "odd.csv"
+    path.write_text("state,action,next\r\n0,a\u2028b,1\r\n1,a\u2028b,0\r\n", encoding="utf-8")
+    assert from_table(path, discount=0.9).action_names == ("a\u2028b",)
+
+
+def test_a_next_state_out_of_range_is_named_by_line_and_column(tmp_path):
+    path = tmp_path / "next.csv"
+    path.write_text("1,2\n0,3\n2,2\n")
+    with pytest.raises(FileError, match=r"line 2: column 2 must lie in \[-1, 3\), got '3'"):
+        from_table(path, discount=0.9)

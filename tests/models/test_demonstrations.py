@@ -485,3 +485,18 @@ def test_demonstrations_of_demonstrations_keep_what_is_known():
     for name in ("states", "actions", "mask", "final_states", "terminated", "is_answer"):
         np.testing.assert_array_equal(getattr(again, name), getattr(shown, name))
     assert not Demonstrations.from_trajectories(shown, [False] * 3).terminated.any()
+
+
+def test_some_trajectories_by_their_numbers():
+    demonstrations = Demonstrations.from_trajectories(RAGGED)
+    np.testing.assert_array_equal(demonstrations[[2, 0]].states, demonstrations.states[np.array([2, 0])])
+    assert len(demonstrations[[]]) == 0
+    with pytest.raises(TypeError, match="trajectories have numbers, got the index 'states'"):
+        demonstrations["states"]
+
+
+@pytest.mark.parametrize("key", [0, None, np.zeros(2)])
+def test_what_is_no_key_is_refused(key):
+    mdp = small_models.case("dense").mdp
+    with pytest.raises(ValueError, match=r"key must be a key of jax\.random"):
+        sample_demonstrations(key, mdp, np.zeros(mdp.num_states, int), 1, 2)

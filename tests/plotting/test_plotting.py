@@ -358,3 +358,8 @@ def test_without_matplotlib_one_message_names_the_extra():
     result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
     assert result.stderr.strip().splitlines()[-1].endswith("pip install '.[plot]'")
     assert "ImportError: jaxhom.plotting needs matplotlib" in result.stderr
+
+
+def test_no_trajectories_are_no_lines():
+    none = Demonstrations.from_trajectories([([0], [0])])[:0]
+    assert not plotting.plot_trajectories(gridworld(4), none).lines

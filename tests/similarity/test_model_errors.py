@@ -9,7 +9,7 @@ import numpy as np
 import oracles
 import pytest
 
-from jaxhom import homomorphism_error
+from jaxhom import homomorphism_error, homomorphism_map
 from jaxhom.similarity import model_errors
 from jaxhom.solvers import pdhg
 
@@ -210,3 +210,20 @@ def test_float32_error():
 def test_shapes_that_do_not_fit_are_refused(source, target, message):
     with pytest.raises(ValueError, match=message):
         homomorphism_error(np.ones(source), np.ones(target))
+
+
+@pytest.mark.parametrize("use", [homomorphism_error, homomorphism_map])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda model: 2.0 * model, r"sum of source\[0, 0\] must be 1"),
+        (lambda model: -model, r"source\[0, 0, 0\] must not be negative"),
+        (lambda model: model * np.nan, r"source\[0, 0, 0\] must be finite"),
+        (lambda model: model[:0, :, :0], r"source must have shape \[n, A, n\], got \(0, 1, 0\)"),
+        (lambda model: [["a"]], "source must hold real numbers"),
+    ],
+)
+def test_what_is_no_model_is_refused(use, change, message):
+    model = np.full((2, 1, 2), 0.5)
+    with pytest.raises(ValueError, match=message):
+        use(change(model), model)

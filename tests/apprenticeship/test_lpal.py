@@ -131,12 +131,12 @@ def test_columns_and_the_interior_point_together(is_small, max_steps, monkeypatc
     """
     here, asked = grid(8 if is_small else 16), []
 
-    class Program(interior_point.Program):
+    class Program(interior_point.LinearProgram):
         def solve(self, expectations, tolerance, **options):
             asked.append(expectations)
             return super().solve(expectations, tolerance, **options | {"max_iterations": max_steps})
 
-    monkeypatch.setattr(interior_point, "Program", Program)
+    monkeypatch.setattr(interior_point, "LinearProgram", Program)
     monkeypatch.setattr(quickest, "_SMALL_STATES", 64 if is_small else 255)
     expectations = np.stack([0.5 * here.expectations["exact"], here.expectations["of both signs"]])
     solution = lpal(here.mdp, expectations)
@@ -424,7 +424,7 @@ def test_a_prepared_model_gives_the_same_and_prepares_nothing_twice(name, method
     for owner, what in (
         (certificate, "Exact"),
         (presolve.Reach, "of"),
-        (interior_point, "Program"),
+        (interior_point, "LinearProgram"),
         (pdhg, "FlowProgram"),
         (column_rounds, "with_compact_features"),
     ):

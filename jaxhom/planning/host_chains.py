@@ -36,6 +36,10 @@ _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
 # Up to these a solve on the host takes less time than a program's compiling, half a second; above such a discount less
 # than the hundreds of products of an iteration.
 _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
+# Linear systems of chains are as quick on the host, lane by lane (bench/results/speed_planning.csv: garnet_sparse four
+# times, grid48 1.4); on racetrack_a a program takes 9.6 ms a lane, the host 12.5, and compiling as long as 500 lanes.
+# With 16 lanes of grid100 both take as long, and on grid316 programs less than half of it.
+_CHAIN_LANES, _CHAIN_STATES = 128, 20_000
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _SMALL_ERROR, _MAX_PRODUCTS = 1e-9, 300  # of BiCGSTAB; racetracks take 50 steps
 _FIRST_SWEEPS = 20
@@ -169,23 +173,27 @@ class HostModel:
         return self.bandwidth <= _NARROW * np.sqrt(self.num_states)
 
     def iterates_sooner(self, lanes: int) -> bool:
-        """Whether products on the host should be tried before the device: few systems of a sparse model.
+        """Whether products on the host should be tried before the device: not too many systems of a sparse model.
 
-        They take tens of milliseconds where the chain mixes, and a program seconds to compile.
+        They take some ten milliseconds where the chain mixes, and a program seconds to compile.
         """
-        return lanes <= _FEW_LANES and scipy.sparse.issparse(self.rows)
+        return self._are_few_chains(lanes) and scipy.sparse.issparse(self.rows)
 
     def solves_sooner(self, lanes: int) -> bool:
-        """Whether the host should be asked before the device for so many linear systems.
+        """Whether factors on the host should be asked before the device for so many linear systems."""
+        return self.is_soon_factorised and (self._are_few_chains(lanes) or self.iterates_slowly)
 
-        A program takes half a second to compile, and hundreds of products where the chain mixes slowly.
-        """
-        is_near_one = self.discount > _MODERATE_DISCOUNT
-        return (lanes <= _FEW_LANES or is_near_one) and self.is_soon_factorised
+    def _are_few_chains(self, lanes: int) -> bool:
+        return lanes <= (_CHAIN_LANES if self.num_states <= _CHAIN_STATES else _FEW_LANES)
+
+    @property
+    def iterates_slowly(self) -> bool:
+        """Whether the discount is so near 1 that a program may take hundreds of products for a linear system."""
+        return self.discount > _MODERATE_DISCOUNT
 
     def plans_sooner(self, lanes: int) -> bool:
         """Whether the host should be asked first for the best policies of so many rewards."""
-        is_small = self.num_states <= _FEW_STATES or self.discount > _MODERATE_DISCOUNT
+        is_small = self.num_states <= _FEW_STATES or self.iterates_slowly
         return lanes <= _FEW_LANES and is_small and self.is_soon_factorised
 
     def moves_sooner(self, error: float) -> bool:

@@ -222,14 +222,16 @@ def _solve_at_hand(
     policies = np.asarray(policy).reshape(-1, mdp.num_states, mdp.num_actions)
     sources = np.broadcast_to(source, (len(policies), mdp.num_states))
     model, solutions = host_model(mdp), np.full(sources.shape, np.nan)
-    is_few = model.iterates_sooner(len(policies))
+    iterates = model.iterates_sooner(len(policies))
 
     def open_lanes() -> np.ndarray:
         return np.flatnonzero(np.isnan(solutions).any(axis=1))
 
-    def on_host(solve: Callable[[HostChain, np.ndarray], np.ndarray], **options) -> None:
+    def on_host(solve: Callable[[HostChain, np.ndarray], np.ndarray], *, gives_up: bool = False, **options) -> None:
         for lane in open_lanes():
             solutions[lane] = solve(model.chain(policies[lane], **options), sources[lane].astype(np.float64))
+            if gives_up and np.isnan(solutions[lane]).any():  # others would take hundreds of products for nothing, too
+                break
 
     def on_device() -> None:
         if len(left := open_lanes()):
@@ -243,9 +245,9 @@ def _solve_at_hand(
         if transpose and model.moves_sooner(_EXACT):
             on_host(lambda chain, source: chain.moved(source, _EXACT, report), may_factorise=False)
         if not model.solves_sooner(len(policies)):
-            if is_few:
-                on_host(solved, may_iterate=True, may_factorise=False)
-            if not (is_few and model.is_swept(_EXACT)):
+            if iterates:
+                on_host(solved, gives_up=True, may_iterate=True, may_factorise=False)
+            if not (iterates and model.is_swept(_EXACT)):
                 on_device()
         if model.is_solvable:
             on_host(solved)

@@ -152,7 +152,7 @@ def soft_reward(xp: ModuleType, policy, reward, temperature):
 def _plan_at_hand(mdp: MDP, reward: Float[np.ndarray, "B S A"], value, temperature: float, goal: _Goal) -> Plan:
     """The plan of concrete arrays: the host first where it is quick, and last for what the program could not do."""
     model = host_model(mdp)
-    if len(reward) <= _FEW_LANES or model.solves_sooner(len(reward)):
+    if len(reward) <= _FEW_LANES or (model.iterates_slowly and model.is_soon_factorised):
         plan = jax.tree.map(np.array, empty_plan(mdp, len(reward)))
         left = np.arange(len(reward))
     else:

@@ -15,10 +15,10 @@ import oracles
 import pytest
 import small_models
 
-from jaxhom import MDP
+from jaxhom import MDP, gridworld
 from jaxhom.planning import chain_solver
 from jaxhom.planning import occupancy as occupancy_module
-from jaxhom.planning.host_chains import HostModel, host_model
+from jaxhom.planning.host_chains import HostChain, HostModel, host_model
 from jaxhom.planning.occupancy import (
     feature_expectations,
     has_occupancy,
@@ -507,3 +507,20 @@ def test_a_long_way_in_a_large_model(monkeypatch):
     expected = 0.99 ** np.arange(length)
     expected[-1] /= 0.01
     np.testing.assert_allclose(mu, expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("lanes", [3, 40])
+def test_the_host_gives_up_at_the_first_chain_that_mixes_slowly(monkeypatch, lanes):
+    """And the device does what is left: one lane of vain products, not one each."""
+    mdp = gridworld(8, discount=0.9).mdp
+    policies = small_models.random_policy(np.random.default_rng(0), lanes, mdp.num_states, mdp.num_actions)
+    expected, asked = occupancy(mdp, policies), []
+
+    def in_vain(chain, right, is_flow, error):
+        asked.append(1)
+        return np.full_like(right, np.nan)
+
+    monkeypatch.setattr(HostModel, "is_soon_factorised", property(lambda model: False))
+    monkeypatch.setattr(HostChain, "_iterate", in_vain)
+    np.testing.assert_allclose(occupancy(mdp, policies), expected, rtol=1e-8, atol=1e-12)
+    assert len(asked) == 1

@@ -8,8 +8,8 @@ solutions of a linear system and of its transpose:
 
 Concrete policies, up to 128 at a time of moderate models, are solved in float64 on the host (`host_chains`), by sparse
 LU on graphs like roads, grids and corridors, and so is what iterations leave open; everything else, and everything
-under jit, vmap and grad, by `chain_solver`. A solution that nobody can vouch for (a policy that holds NaN, say) comes back as NaN, never as a wrong
-number. Derivatives are implicit (one more solve with the transpose), whatever the method.
+under jit, vmap and grad, by `chain_solver`. A solution that nobody can vouch for (a policy that holds NaN, say) comes
+back as NaN, never as a wrong number. Derivatives are implicit (one more solve with the transpose), whatever the method.
 
 Policies are [S, A] or a batch [B, S, A]; inside, the batch is the last axis. The way back, from an occupancy to the
 policy that has it, is eq. (5).

@@ -221,3 +221,10 @@ def test_labels_where_an_action_is_not_allowed_count_unless_they_are_not_finite(
     expected = np.where(np.isnan(given), 0, given)
     np.testing.assert_array_equal(check_labels(model(), given), expected)
     np.testing.assert_array_equal(jax.jit(lambda labels: check_labels(model(), labels))(given), expected)
+
+
+def test_rewards_of_texts_are_refused_by_name():
+    mdp = jaxhom.MDP.from_dense(np.eye(2)[:, None], discount=0.9)
+    for reward in (np.full((2, 1), "1"), np.full((2, 1), "1", object)):
+        with pytest.raises(ValueError, match="reward must hold real numbers"):
+            jaxhom.optimal_policy(mdp, reward)

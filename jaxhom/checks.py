@@ -201,10 +201,11 @@ def require_distribution(
     if rows is not None:
         array = np.where(rows[..., None], array, 0)
     array = require_floats(name, array, axes)
-    is_rounding = (array < 0) & (array >= -8.0 * np.finfo(array.dtype).eps)  # as 1 - 0.9 - 0.1
-    if is_rounding.any():
+    is_negative = array < 0
+    if is_negative.any():
+        is_rounding = is_negative & (array >= -8.0 * np.finfo(array.dtype).eps)  # as 1 - 0.9 - 0.1
+        require_all(name, array, ~is_negative | is_rounding, "must not be negative", axes=axes)
         array = np.where(is_rounding, 0, array)
-    require_all(name, array, array >= 0, "must not be negative", axes=axes)
     with np.errstate(over="ignore"):
         total = array.sum(axis=-1, dtype=np.float64)
     if rows is not None:

@@ -36,9 +36,9 @@ _MAX_ENTRIES = 2e8  # states times bandwidth: what a factor may hold
 # Up to these a solve on the host takes less time than a program's compiling, half a second; above such a discount less
 # than the hundreds of products of an iteration.
 _FEW_LANES, _FEW_STATES, _MODERATE_DISCOUNT = 4, 1024, 0.99
-# Linear systems of chains are as quick on the host, lane by lane (bench/results/speed_planning.csv: garnet_sparse four
-# times, grid48 1.4); on racetrack_a a program takes 9.6 ms a lane, the host 12.5, and compiling as long as 500 lanes.
-# With 16 lanes of grid100 both take as long, and on grid316 programs less than half of it.
+# Linear systems of chains are as quick on the host, lane by lane, as in programs, or quicker, on most models of
+# bench/results/speed_planning.csv (garnet_sparse, grid16 to grid100), and nothing compiles; on racetrack_a programs are
+# quicker by less than compiling takes. On grid316 they take less than half as long.
 _CHAIN_LANES, _CHAIN_STATES = 128, 20_000
 _GOOD_ENOUGH = 1e-3  # relative error that a residual may allow, beyond which nothing is returned
 _SMALL_ERROR, _MAX_PRODUCTS = 1e-9, 300  # of BiCGSTAB; racetracks take 50 steps

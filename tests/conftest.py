@@ -20,6 +20,7 @@ import small_models
 
 from jaxhom.programs import folder_for_programs
 
+_OBJECTS = 100_000  # new ones after which Python looks for cycles; traces are many objects and leave few
 _MUCH = 3e9  # bytes of a process from which on it gives memory back; then it compiles again what it had compiled
 _FEWER_PASSES = (
     "--xla_backend_optimization_level=0",
@@ -28,6 +29,7 @@ _FEWER_PASSES = (
     "--xla_llvm_force_inline_before_split=false",
 )
 
+gc.set_threshold(_OBJECTS)
 jax.config.update("jax_enable_x64", True)
 
 if not os.environ.get("JAXHOM_TESTS_AS_USERS"):

@@ -236,9 +236,9 @@ def plain(name: str, lane: int = 0):
 
 @functools.cache
 def mapped(name: str):
-    """The lanes under vmap."""
+    """The lanes under vmap; as one program, since otherwise every operation is compiled by itself."""
     case = cases()[name]
-    return jax.vmap(of_case(case))(stacked(case.argument))
+    return jax.jit(jax.vmap(of_case(case)))(stacked(case.argument))
 
 
 def close(found, expected):

@@ -26,7 +26,7 @@ import scipy
 
 from jaxhom.models.mdp import MDP
 from jaxhom.planning import policy_iteration
-from jaxhom.planning.host_chains import host_model
+from jaxhom.planning.host_chains import host_model, transition_under
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -245,7 +245,7 @@ class Exact:
         if self.is_direct and not self._is_given:
             chain = self.model.chain(policy)
             return chain.state_occupancy(right) if is_flow else chain.value(right)
-        matrix = self._transition(policy)
+        matrix = transition_under(policy, self.rows)
         if self.is_direct:
             return _solve_directly(matrix.T if is_flow else matrix, self.discount, right)
         matrix = matrix.T if is_flow else matrix
@@ -254,17 +254,6 @@ class Exact:
         with np.errstate(all="ignore"):
             options = {"rtol": _KRYLOV_RESIDUAL, "atol": 0.0, "maxiter": _MAX_KRYLOV_STEPS}
             return scipy.sparse.linalg.bicgstab(system, right, x0=start, **options)[0]
-
-    def _transition(self, policy):
-        """P_pi of a policy [S, A] or of actions [S]."""
-        num_actions = self.model.num_actions
-        if policy.ndim == 1:
-            return self.rows[np.arange(len(policy)) * num_actions + policy]
-        if not scipy.sparse.issparse(self.rows):
-            return np.einsum("sa,saz->sz", policy, self.rows.reshape(*policy.shape, -1))
-        state, action = np.nonzero(policy)
-        entries = (policy[state, action], (state, state * num_actions + action))
-        return scipy.sparse.csr_array(entries, shape=(len(policy), policy.size)) @ self.rows
 
 
 def _solve_directly(matrix, discount: float, right: np.ndarray) -> np.ndarray:

@@ -87,10 +87,10 @@ def _cholesky(normal: scipy.sparse.sparray, blocks: Blocks) -> BlockCholesky:
     """With as little regularisation as rounding asks for: certificates do not need exact projections."""
     for share in _REGULARISATIONS:
         try:
-            return BlockCholesky(normal, blocks, share)
+            return BlockCholesky(blocks.cut(normal), blocks, share)
         except np.linalg.LinAlgError:
             continue
-    return BlockCholesky(normal, blocks, 1.0)
+    return BlockCholesky(blocks.cut(normal), blocks, 1.0)
 
 
 def _reordered(mdp: MDP, blocks: Blocks, dtype: DTypeLike) -> MDP:

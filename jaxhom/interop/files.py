@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 DEMONSTRATIONS = ("states", "actions", "length", "terminated", "final_states", "is_answer")
 _ALONE = "marks a trajectory of more than one step"
+_ENDS_HIDDEN = "must be False where the last step is hidden: what it led to is not known"
 
 
 def load_mdp(path: str | os.PathLike, *, discount: Float[ArrayLike, ""] | None = None) -> MDP:
@@ -114,6 +115,9 @@ def load_demonstrations(path: str | os.PathLike) -> Demonstrations:
         if (mask != steps).any():  # hidden steps; text is left to the checks below
             actions = np.where(mask, actions, 0)
             shown = np.where(mask.any(axis=1), horizon - mask[:, ::-1].argmax(axis=1), length)
+            if "terminated" in arrays:
+                terminated = checks.require_flags("terminated", arrays["terminated"], count)
+                checks.require_all("terminated", terminated, ~terminated | (shown == length), _ENDS_HIDDEN)
             final = np.where(shown < length, states[np.arange(count), np.minimum(shown, horizon - 1)], final)
             length = shown  # the state after the last step that is shown is the final one
         rows = zip(states, actions, length, final, strict=True)

@@ -19,7 +19,7 @@ from jaxhom.models.names import Names
 
 def names_as_array(names: Names) -> np.ndarray:
     """The names in the first of the module's forms that gives them back; their texts if none does."""
-    if all(type(name) is str for name in names):
+    if all(type(name) is str and not name.endswith("\0") for name in names):  # NumPy pads texts with NUL
         return np.array(names)
     if all(_is_index(name) for name in names):
         return np.array(names, np.int64)

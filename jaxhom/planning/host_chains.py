@@ -130,21 +130,7 @@ class HostModel:
         by_products = may_iterate and not self.is_soon_factorised
         may_factorise &= self.is_solvable or not by_products  # who does not want products has asked before
         order = self._order if self.is_band and not by_products else None
-        return HostChain(self._transition(policy), self.discount, by_products, may_factorise, order)
-
-    def _transition(self, policy) -> np.ndarray | scipy.sparse.csr_array:
-        states = np.arange(self.num_states)
-        if policy.ndim == 2 and (np.count_nonzero(policy, axis=1) == 1).all():
-            policy = policy.argmax(axis=1)
-        if policy.ndim == 1:
-            return self.rows[states * self.num_actions + policy]
-        policy = np.asarray(policy, np.float64)
-        if not scipy.sparse.issparse(self.rows):
-            return np.einsum("sa,saz->sz", policy, self.rows.reshape(*policy.shape, -1))
-        state, action = np.nonzero(policy)
-        entries = (policy[state, action], (state, state * self.num_actions + action))
-        choice = scipy.sparse.csr_array(entries, shape=(self.num_states, len(states) * self.num_actions))
-        return choice @ self.rows
+        return HostChain(transition_under(policy, self.rows), self.discount, by_products, may_factorise, order)
 
     @property
     def bandwidth(self) -> int:
@@ -358,6 +344,26 @@ class HostChain:
         if isinstance(self._factor, tuple):
             return scipy.linalg.lu_solve(self._factor, right, trans=1 if is_flow else 0)
         return self._factor.solve(right, "N" if is_flow else "T")
+
+
+def transition_under(
+    policy: Float[np.ndarray, "S A"] | Int[np.ndarray, " S"], rows: Float[np.ndarray, "S*A S"] | scipy.sparse.csr_array
+) -> Float[np.ndarray, "S S"] | scipy.sparse.csr_array:
+    """P_pi of a policy, or of the actions that a deterministic one takes, from transitions with a row per pair.
+
+    The rows of the policy sum to 1.
+    """
+    num_states, num_actions = len(policy), rows.shape[0] // len(policy)
+    if policy.ndim == 2 and (np.count_nonzero(policy, axis=1) == 1).all():
+        policy = policy.argmax(axis=1)
+    if policy.ndim == 1:
+        return rows[np.arange(num_states) * num_actions + policy]
+    policy = np.asarray(policy, np.float64)
+    if not scipy.sparse.issparse(rows):
+        return np.einsum("sa,saz->sz", policy, rows.reshape(*policy.shape, -1))
+    state, action = np.nonzero(policy)
+    entries = (policy[state, action], (state, state * num_actions + action))
+    return scipy.sparse.csr_array(entries, shape=(num_states, policy.size)) @ rows
 
 
 def _or_one(total: np.ndarray) -> np.ndarray:

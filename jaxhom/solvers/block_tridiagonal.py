@@ -47,6 +47,33 @@ class Blocks:
         """Multiplications of a factorisation, to compare orders by."""
         return float(self.count) * self.size**3
 
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of a matrix in blocks: those on the diagonal first, then those left of it."""
+        return 2, self.count, self.size, self.size
+
+    def places(self, row: Int[np.ndarray, " e"], column: Int[np.ndarray, " e"]) -> Int[np.ndarray, " e"]:
+        """Where entries of a matrix lie in its blocks, raveled; -1 right of the diagonal's blocks."""
+        (i, k), (j, m) = divmod(self.place[row], self.size), divmod(self.place[column], self.size)
+        return np.where(i >= j, (((i - j) * self.count + i) * self.size + k) * self.size + m, -1)
+
+    def filled(
+        self, places: Int[np.ndarray, " e"], numbers: Float[np.ndarray, " e"]
+    ) -> Float[np.ndarray, "2 count size size"]:
+        """A matrix in blocks, with numbers in their places, the last block filled up with the identity."""
+        result = np.zeros(self.shape)
+        result.ravel()[places] = numbers
+        filling = np.arange(len(self.order) - (self.count - 1) * self.size, self.size)
+        result[0, -1, filling, filling] = 1.0
+        return result
+
+    def cut(self, matrix: scipy.sparse.sparray | np.ndarray) -> Float[np.ndarray, "2 count size size"]:
+        """A symmetric matrix [n, n], sparse or dense, in blocks."""
+        entries = scipy.sparse.coo_array(matrix)
+        places = self.places(entries.row, entries.col)
+        is_kept = places >= 0
+        return self.filled(places[is_kept], entries.data[is_kept])
+
 
 def order_in_blocks(pattern: scipy.sparse.sparray | np.ndarray, min_size: int = 1) -> Blocks:
     """Reverse Cuthill-McKee order of a symmetric sparse matrix [n, n]; one block where its band is not narrow.
@@ -72,7 +99,7 @@ class BlockCholesky:
     Block row i of L is (..., `left[i]`, inverse of `inverse[i]`), the inverse triangular factors being what solves use.
 
     Args:
-      matrix: N [n, n], symmetric positive definite, sparse or dense, with the pattern that `blocks` was made for.
+      matrix: N, symmetric positive definite, in blocks (`Blocks.cut`); the factor takes its place.
       blocks: its order.
       regularisation: share by which each entry of the diagonal is made larger.
 
@@ -80,9 +107,9 @@ class BlockCholesky:
       numpy.linalg.LinAlgError: if the matrix is not positive definite in floating point.
     """
 
-    def __init__(self, matrix: scipy.sparse.sparray | np.ndarray, blocks: Blocks, regularisation: float = 0.0):
+    def __init__(self, matrix: Float[np.ndarray, "2 count size size"], blocks: Blocks, regularisation: float = 0.0):
         self.blocks = blocks
-        diagonal, self.left = self._cut(matrix)
+        diagonal, self.left = matrix
         corners = np.arange(blocks.size)
         diagonal[:, corners, corners] *= 1.0 + regularisation
         self.inverse = np.empty_like(diagonal)
@@ -91,22 +118,6 @@ class BlockCholesky:
                 self.left[i] = self.left[i] @ self.inverse[i - 1].T
                 block -= self.left[i] @ self.left[i].T
             self.inverse[i] = _inverse_factor(block)
-
-    def _cut(self, matrix) -> tuple[np.ndarray, np.ndarray]:
-        """The blocks [count, size, size] on the diagonal, and those left of it."""
-        blocks, size = self.blocks, self.blocks.size
-        if blocks.count == 1:
-            whole = matrix.toarray() if scipy.sparse.issparse(matrix) else np.array(matrix)
-            return whole[None], np.zeros_like(whole[None])
-        diagonal, left = np.zeros((2, blocks.count, size, size))
-        entries = scipy.sparse.coo_array(matrix)
-        row, column = blocks.place[entries.row], blocks.place[entries.col]
-        (i, k), (j, m) = divmod(row, size), divmod(column, size)
-        for target, chosen in ((diagonal, i == j), (left, i == j + 1)):
-            target[i[chosen], k[chosen], m[chosen]] = entries.data[chosen]
-        filling = np.arange(len(blocks.order) - (blocks.count - 1) * size, size)
-        diagonal[-1, filling, filling] = 1.0
-        return diagonal, left
 
     def unit_factor(self) -> tuple[Float[np.ndarray, "count size size"], Float[np.ndarray, "count size size"]]:
         """Blocks [count, size, size] left of the unit diagonal of U, and inverses of those of C, in U C U^T = N."""

@@ -11,20 +11,21 @@ part is diagonal, and where each concerns few states the band stays narrow. *Aft
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
 
-from jaxhom.solvers.block_tridiagonal import BlockCholesky, order_in_blocks
+from jaxhom.solvers.block_tridiagonal import BlockCholesky, Blocks, order_in_blocks
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float, Int
 
 REGULARISATION = 1e-14  # share of each diagonal entry of what is factorised
 REFINEMENTS = 2  # per solve, at most: as d spreads, the factorisation alone loses digits
 ACCURATE = 1e-8  # share of the right-hand side that may be missing
 _MIN_BLOCK = 32  # smaller ones are more calls, not less work
+_MANY_PRODUCTS = 1e7  # of entries of A, from which on their places take more memory than the matrices
 _DENSE = 0.2  # share of entries from which on dense products are taken to be faster
 
 
@@ -51,13 +52,14 @@ class Rows:
             before = _Before(core, others)
             self._normal = before if before.work <= self._normal.work else self._normal
         self.work = self._normal.work
+        self._normal.prepare()
 
     def factor(self, d: Float[np.ndarray, " m"]) -> None:
         """Factorises the system for d [m] positive; `numpy.linalg.LinAlgError` where rounding makes it indefinite."""
         self._d = d
         self._normal.factor(d)
         self._behind_free = self._normal.solve(self.free_columns)
-        self._free_block = self.free_columns.T @ self._behind_free
+        self._free_inverse = np.linalg.inv(self.free_columns.T @ self._behind_free)
 
     def solve(
         self, right: Float[np.ndarray, " n"], free_right: Float[np.ndarray, " q"]
@@ -76,7 +78,7 @@ class Rows:
 
     def _solve_once(self, right, free_right):
         y = self._normal.solve(right)
-        f = np.linalg.solve(self._free_block, self.free_columns.T @ y - free_right)
+        f = self._free_inverse @ (self.free_columns.T @ y - free_right)
         return y - self._behind_free @ f, f
 
 
@@ -84,17 +86,30 @@ class _Before:
     """A D A^T with rows that share no column eliminated before the core."""
 
     def __init__(self, core, others):
-        self._core, self._core_transpose = core, core.T.tocsr()
-        self._others, self._others_transpose = others, others.T.tocsr()
-        self._square = others.multiply(others).tocsr()
-        shared = abs(core) @ abs(self._others_transpose)
-        self._blocks = order_in_blocks(abs(core) @ abs(self._core_transpose) + shared @ shared.T, _MIN_BLOCK)
+        self._core, self._others = core, others
+        shared = abs(core) @ abs(others.T)
+        self._blocks = order_in_blocks(abs(core) @ abs(core.T) + shared @ shared.T, _MIN_BLOCK)
         self.work = self._blocks.work
 
+    def prepare(self) -> None:
+        """What is the same for every d."""
+        core, others, blocks = self._core, self._others, self._blocks
+        self._core_product, self._square = _CoreProduct(core, blocks), others.multiply(others).tocsr()
+        cross = _Product.of(core, others)
+        self._cross_product, shape = cross, (core.shape[0], others.shape[0])
+        self._cross = scipy.sparse.csr_array((np.zeros(len(cross.row)), (cross.row, cross.column)), shape=shape)
+        self._cross_transpose = self._cross.T  # of the same numbers
+        self._first, self._second = _in_one_column(cross.column, cross.column)
+        place = blocks.places(cross.row[self._first], cross.row[self._second])
+        is_kept = place >= 0
+        self._first, self._second = self._first[is_kept], self._second[is_kept]
+        self._places, self._entry = np.unique(place[is_kept], return_inverse=True)
+
     def factor(self, d: np.ndarray) -> None:
-        scaled = self._core * d
-        self._cross, self._diagonal = scaled @ self._others_transpose, self._square @ d
-        schur = scaled @ self._core_transpose - (self._cross / self._diagonal) @ self._cross.T
+        self._cross.data[:], self._diagonal = self._cross_product(d), self._square @ d
+        schur, half = self._core_product(d), self._cross.data / np.sqrt(self._diagonal)[self._cross_product.column]
+        behind = np.bincount(self._entry, half[self._first] * half[self._second], len(self._places))
+        schur.ravel()[self._places] -= behind
         self._factor = BlockCholesky(schur, self._blocks, REGULARISATION)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
@@ -102,7 +117,7 @@ class _Before:
         core, others = right[:num_core], right[num_core:]
         diagonal = self._diagonal.reshape(-1, *(1,) * (right.ndim - 1))
         y = self._factor.solve(core - self._cross @ (others / diagonal))
-        return np.concatenate([y, (others - self._cross.T @ y) / diagonal])
+        return np.concatenate([y, (others - self._cross_transpose @ y) / diagonal])
 
 
 class _After:
@@ -110,15 +125,19 @@ class _After:
 
     def __init__(self, core, others):
         self._blocks = order_in_blocks(abs(core) @ abs(core).T, _MIN_BLOCK)
-        self._core, self._core_transpose = _stored(core), _stored(core.T)
+        self._core = _stored(core)
         self._others, self._others_transpose = _stored(others), _stored(others.T)
         num_core, num_others = core.shape[0], others.shape[0]
         border = num_core * num_others * (2 * self._blocks.size + num_others) + num_others**3 / 3
         self.work = self._blocks.work + border
 
+    def prepare(self) -> None:
+        """What is the same for every d."""
+        self._core_product = _CoreProduct(self._core, self._blocks)
+
     def factor(self, d: np.ndarray) -> None:
         scaled = self._core * d
-        self._factor = BlockCholesky(scaled @ self._core_transpose, self._blocks, REGULARISATION)
+        self._factor = BlockCholesky(self._core_product(d), self._blocks, REGULARISATION)
         half = self._factor.solve_lower(_dense(scaled @ self._others_transpose))
         self._half = half.reshape(-1, half.shape[-1])
         corner = _dense((self._others * d) @ self._others_transpose) - self._half.T @ self._half
@@ -132,6 +151,60 @@ class _After:
         others = scipy.linalg.cho_solve(self._corner, others, check_finite=False)
         core = self._factor.solve_upper(half - (self._half @ others).reshape(half.shape))
         return np.concatenate([core, others])
+
+
+class _CoreProduct:
+    """The core's part of A D A^T, in blocks: sums of known products where they are not too many."""
+
+    def __init__(self, core: scipy.sparse.sparray | np.ndarray, blocks: Blocks):
+        self._core, self._transpose, self._blocks, self._product = core, core.T, blocks, None
+        if not scipy.sparse.issparse(core):
+            return
+        self._transpose = core.T.tocsr()
+        if (np.diff(self._transpose.indptr).astype(float) ** 2).sum() <= _MANY_PRODUCTS:
+            product = _Product.of(core, core)
+            places = blocks.places(product.row, product.column)
+            self._product, self._places = product.only(places >= 0), places[places >= 0]
+
+    def __call__(self, d: np.ndarray) -> np.ndarray:
+        if self._product is None:
+            return self._blocks.cut((self._core * d) @ self._transpose)
+        return self._blocks.filled(self._places, self._product(d))
+
+
+class _Product(NamedTuple):
+    """The entries of F D G^T that are not 0 for every D = diag(d): `sums` @ d, row by row."""
+
+    row: Int[np.ndarray, " e"]
+    column: Int[np.ndarray, " e"]
+    sums: scipy.sparse.csr_array
+
+    @classmethod
+    def of(cls, first: scipy.sparse.sparray, second: scipy.sparse.sparray) -> _Product:
+        f, g = first.tocoo(), second.tocoo()
+        of_first, of_second = _in_one_column(f.col, g.col)
+        place = f.row[of_first].astype(np.int64) * g.shape[0] + g.row[of_second]
+        places, entry = np.unique(place, return_inverse=True)
+        products = f.data[of_first] * g.data[of_second]
+        sums = scipy.sparse.csr_array((products, (entry, f.col[of_first])), shape=(len(places), f.shape[1]))
+        return cls(places // g.shape[0], places % g.shape[0], sums)
+
+    def only(self, is_kept: Bool[np.ndarray, " e"]) -> _Product:
+        return _Product(self.row[is_kept], self.column[is_kept], self.sums[is_kept])
+
+    def __call__(self, d: np.ndarray) -> np.ndarray:
+        return self.sums @ d
+
+
+def _in_one_column(
+    first: Int[np.ndarray, " m"], second: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
+    """All pairs of an entry of one matrix and one of another, given their columns, that stand in the same."""
+    count = np.bincount(second, minlength=max(first.max(initial=-1), second.max(initial=-1)) + 1)
+    begin, partners = np.cumsum(count) - count, count[first]
+    of_first = np.repeat(np.arange(len(first)), partners)
+    number = np.arange(len(of_first)) - np.repeat(np.cumsum(partners) - partners, partners)
+    return of_first, np.argsort(second, kind="stable")[begin[first[of_first]] + number]
 
 
 def _stored(matrix):

@@ -249,6 +249,16 @@ def test_where_the_last_steps_are_hidden_the_state_after_those_shown_is_the_fina
     assert load_demonstrations(path).final_states.tolist() == [1, 2]
 
 
+def test_an_episode_whose_last_step_is_hidden_cannot_have_terminated(tmp_path):
+    path = tmp_path / "demos.npz"
+    walks = {"states": [[0, 1, 0], [3, 1, 2]], "actions": [[1, 0, 1], [1, 0, -1]], "final_states": [2, 4]}
+    np.savez(path, **walks, terminated=[True, False])
+    assert load_demonstrations(path).terminated.tolist() == [True, False]
+    np.savez(path, **walks, terminated=[True, True])
+    with pytest.raises(FileError, match=r"terminated\[1\] must be False where the last step is hidden"):
+        load_demonstrations(path)
+
+
 def test_trajectories_without_a_step_are_not_saved(tmp_path):
     broken = Demonstrations(states=jnp.zeros((1, 3), int), actions=jnp.zeros((1, 3), int), mask=jnp.zeros((1, 3), bool))
     with pytest.raises(ValueError, match=r"mask\[0\] must be True on one step of each trajectory at least"):
@@ -274,6 +284,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     ("names", "back"),
     [
         (["door", "room"], ("door", "room")),
+        (["a", "a\0"], ("a", "a\0")),
         ([3, -1], (3, -1)),
         ([(0, 1), (2, 3)], ((0, 1), (2, 3))),
         ([(0, 1), (2, 3, 4)], ((0, 1), (2, 3, 4))),

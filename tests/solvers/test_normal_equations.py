@@ -25,7 +25,7 @@ def test_block_cholesky(size, width, min_size, count, rng):
     matrix = banded(rng, size, width)
     blocks = order_in_blocks(matrix, min_size)
     assert blocks.count == count
-    factor = BlockCholesky(scipy.sparse.csr_array(matrix), blocks)
+    factor = BlockCholesky(blocks.cut(scipy.sparse.csr_array(matrix)), blocks)
     for right in (rng.normal(size=size), rng.normal(size=(size, 3))):
         np.testing.assert_allclose(factor.solve(right), np.linalg.solve(matrix, right), rtol=0, atol=1e-10)
     # U C U^T = N in the order of the blocks
@@ -45,7 +45,8 @@ def test_a_matrix_that_is_not_positive_definite(size):
     matrix = np.eye(size)
     matrix[2, 2] = -1.0
     with pytest.raises(np.linalg.LinAlgError, match="minor"):
-        BlockCholesky(matrix, order_in_blocks(matrix))
+        blocks = order_in_blocks(matrix)
+        BlockCholesky(blocks.cut(matrix), blocks)
 
 
 def program(kind):
@@ -82,8 +83,10 @@ def test_systems_of_a_step(kind, rng):
     np.testing.assert_allclose(free_columns.T @ y, free_right, rtol=1e-9)
 
 
+@pytest.mark.parametrize("most", [0, np.inf], ids=["by SciPy", "by known products"])
 @pytest.mark.parametrize("kind", ["regions", "states"])
-def test_both_orders_of_elimination_agree(kind, rng):
+def test_both_orders_of_elimination_agree(kind, most, rng, monkeypatch):
+    monkeypatch.setattr(normal_equations, "_MANY_PRODUCTS", most)
     matrix, free_columns = program(kind)
     d = rng.uniform(0.1, 1.0, size=matrix.shape[1])
     right = rng.normal(size=matrix.shape[0])
@@ -92,6 +95,7 @@ def test_both_orders_of_elimination_agree(kind, rng):
     core, others = matrix.tocsr()[:64], matrix.tocsr()[64:]
     for order in (normal_equations._Before, normal_equations._After):
         system = order(core, others)
+        system.prepare()
         system.factor(d)
         np.testing.assert_allclose(system.solve(right), exact, rtol=1e-6)
         np.testing.assert_allclose(system.solve(free_columns), np.linalg.solve(normal, free_columns), rtol=1e-6)

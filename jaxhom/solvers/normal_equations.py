@@ -94,7 +94,7 @@ class _Before:
     def prepare(self) -> None:
         """What is the same for every d."""
         core, others, blocks = self._core, self._others, self._blocks
-        self._core_product, self._square = _CoreProduct(core, blocks), others.multiply(others).tocsr()
+        self._core_product, self._square = _Assembly(core, core, blocks), others.multiply(others).tocsr()
         cross = _Product.of(core, others)
         self._cross_product, shape = cross, (core.shape[0], others.shape[0])
         self._cross = scipy.sparse.csr_array((np.zeros(len(cross.row)), (cross.row, cross.column)), shape=shape)
@@ -125,22 +125,23 @@ class _After:
 
     def __init__(self, core, others):
         self._blocks = order_in_blocks(abs(core) @ abs(core).T, _MIN_BLOCK)
-        self._core = _stored(core)
-        self._others, self._others_transpose = _stored(others), _stored(others.T)
+        self._core, self._others = _stored(core), _stored(others)
         num_core, num_others = core.shape[0], others.shape[0]
         border = num_core * num_others * (2 * self._blocks.size + num_others) + num_others**3 / 3
         self.work = self._blocks.work + border
 
     def prepare(self) -> None:
         """What is the same for every d."""
-        self._core_product = _CoreProduct(self._core, self._blocks)
+        core, others = self._core, self._others
+        self._core_product = _Assembly(core, core, self._blocks)
+        self._border = _Assembly(core, others, _Whole(core.shape[0], others.shape[0]))
+        self._corner_product = _Assembly(others, others, _Whole(others.shape[0], others.shape[0]))
 
     def factor(self, d: np.ndarray) -> None:
-        scaled = self._core * d
         self._factor = BlockCholesky(self._core_product(d), self._blocks, REGULARISATION)
-        half = self._factor.solve_lower(_dense(scaled @ self._others_transpose))
+        half = self._factor.solve_lower(self._border(d))
         self._half = half.reshape(-1, half.shape[-1])
-        corner = _dense((self._others * d) @ self._others_transpose) - self._half.T @ self._half
+        corner = self._corner_product(d) - self._half.T @ self._half
         corner[np.diag_indices_from(corner)] *= 1.0 + REGULARISATION
         self._corner = scipy.linalg.cho_factor(corner, lower=True, overwrite_a=True, check_finite=False)
 
@@ -153,23 +154,47 @@ class _After:
         return np.concatenate([core, others])
 
 
-class _CoreProduct:
-    """The core's part of A D A^T, in blocks: sums of known products where they are not too many."""
+class _Whole(NamedTuple):
+    """A matrix as a plain array, made as `Blocks` makes one in blocks."""
 
-    def __init__(self, core: scipy.sparse.sparray | np.ndarray, blocks: Blocks):
-        self._core, self._transpose, self._blocks, self._product = core, core.T, blocks, None
-        if not scipy.sparse.issparse(core):
+    num_rows: int
+    num_columns: int
+
+    def places(self, row: Int[np.ndarray, " e"], column: Int[np.ndarray, " e"]) -> Int[np.ndarray, " e"]:
+        return row * self.num_columns + column
+
+    def filled(self, places: Int[np.ndarray, " e"], numbers: Float[np.ndarray, " e"]) -> np.ndarray:
+        result = np.zeros(self)
+        result.ravel()[places] = numbers
+        return result
+
+    def cut(self, matrix: scipy.sparse.sparray | np.ndarray) -> np.ndarray:
+        return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
+
+
+class _Assembly:
+    """F D G^T for many D = diag(d) in a layout: by sums of known products where both are sparse and those few."""
+
+    def __init__(
+        self,
+        first: scipy.sparse.sparray | np.ndarray,
+        second: scipy.sparse.sparray | np.ndarray,
+        layout: Blocks | _Whole,
+    ):
+        self._first, self._transpose, self._layout, self._product = first, second.T, layout, None
+        if not (scipy.sparse.issparse(first) and scipy.sparse.issparse(second)):
             return
-        self._transpose = core.T.tocsr()
-        if (np.diff(self._transpose.indptr).astype(float) ** 2).sum() <= _MANY_PRODUCTS:
-            product = _Product.of(core, core)
-            places = blocks.places(product.row, product.column)
+        self._transpose = second.T.tocsr()
+        in_columns = np.diff(first.tocsc().indptr).astype(float) @ np.diff(self._transpose.indptr)
+        if in_columns <= _MANY_PRODUCTS:
+            product = _Product.of(first, second)
+            places = layout.places(product.row, product.column)
             self._product, self._places = product.only(places >= 0), places[places >= 0]
 
     def __call__(self, d: np.ndarray) -> np.ndarray:
         if self._product is None:
-            return self._blocks.cut((self._core * d) @ self._transpose)
-        return self._blocks.filled(self._places, self._product(d))
+            return self._layout.cut((self._first * d) @ self._transpose)
+        return self._layout.filled(self._places, self._product(d))
 
 
 class _Product(NamedTuple):
@@ -211,7 +236,3 @@ def _stored(matrix):
     """A matrix as its products are fastest."""
     is_dense = matrix.nnz > _DENSE * matrix.shape[0] * matrix.shape[1]
     return matrix.toarray() if is_dense else matrix.tocsr()
-
-
-def _dense(matrix) -> np.ndarray:
-    return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxhom.generalization import evidence
 from jaxhom.generalization.explanation import Explanation
-from jaxhom.generalization.votes import is_nearest, policies_that_count, square_distances
+from jaxhom.generalization.votes import nearest, policies_that_count, square_distances
 from jaxhom.generalization.voting import HostBallots, VotingRule
 from jaxhom.models.graph import steps_from
 from jaxhom.models.mdp import MDP, deciding_states
@@ -118,8 +118,8 @@ class ByCoordinates:
         experts = _experts(self.mdp, general, state)
         if int(general.radius[state]) < 0:
             return _uniform(general, state, method, "no demonstrated state has a vote here")
-        square = square_distances(self.coordinates[[state]], self.coordinates[experts])
-        votes_for = is_nearest(square)[0]
+        square = square_distances(self.coordinates[[state]].astype(float), self.coordinates[experts])
+        votes_for = nearest(square, self.coordinates)[0][0]
         voters, distances = experts[votes_for], np.sqrt(square[0, votes_for])
         reason = f"{_voted(voters)}, at distance {distances[0]:.4g}."
         return _mean_of(general, state, method, reason, voters, distances, mdp=self.mdp)

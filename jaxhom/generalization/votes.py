@@ -5,19 +5,27 @@ the first t at which s^t holds demonstrated states that have a vote there, these
 k-NN by Euclidean distance takes the nearest. On the host; `votes_in_program` does the same where something is traced.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jaxhom.generalization import evidence
 from jaxhom.models.graph import reachable_within
 from jaxhom.models.mdp import MDP, deciding_states
+from jaxhom.solvers.arrays import module_of
+
+if TYPE_CHECKING:
+    from jaxtyping import Array
 
 _CHUNK_BYTES = 64 * 2**20  # of distances at a time
 Ballots = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """The votes [P, A] of demonstrated states [P] in states [P]; zero where one has none."""
-TIE = 1e-9  # relative difference of two distances that rounding may have made
+_TIE = 1e-9  # relative difference of two squares that the rounding of any coordinates may have made
+_NEVER_ROUNDING = 1e-3  # of a distance: more than that is rounded up, however far it is
+_FARTHEST = 2.0**31 - 128.0  # a radius that int32 and float32 hold
 
 
 class Votes(NamedTuple):
@@ -111,16 +119,15 @@ def vote_of_nearest(visited, policy, coordinates: np.ndarray, accept=None) -> Vo
         return found
     chunk = max(1, _CHUNK_BYTES // (8 * coordinates[experts].size))
     for states in np.split(waiting, range(chunk, len(waiting), chunk)):
-        square = square_distances(coordinates[states], coordinates[experts])
+        square = square_distances(coordinates[states].astype(float), coordinates[experts])
         if accept is not None:
             pairs = (array.ravel() for array in np.broadcast_arrays(states[:, None], experts))
             square = np.where(accept(*pairs).reshape(square.shape), square, np.inf)
         is_found = np.isfinite(square.min(axis=1))
         states, square = states[is_found], square[is_found]
-        votes_for = is_nearest(square)
+        votes_for, found.radius[states] = nearest(square, coordinates)
         found.support[states] = votes_for.sum(axis=1)
         found.policy[states] = votes_for @ policy[experts] / found.support[states, None]
-        found.radius[states] = np.maximum(np.ceil(np.sqrt(square.min(axis=1)) * (1 - TIE)), 1)
     return found
 
 
@@ -129,9 +136,23 @@ def square_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return ((points[:, None] - others) ** 2).sum(axis=-1)
 
 
-def is_nearest(square: np.ndarray, tie: float = TIE) -> np.ndarray:
-    """bool [N, E]: which are at the least distance of their row, up to rounding."""
-    return square <= square.min(axis=1, keepdims=True) * (1 + tie)
+def nearest(square: Array, coordinates: Array) -> tuple[Array, Array]:
+    """Which are at the least distance of their row, and that distance, rounded up; in NumPy or JAX.
+
+    Args:
+      square: [N, E], squares of distances; infinite where a pair does not count.
+      coordinates: [S, D], which may have been rounded: 5e6 + 0.1 is not known to the last digit of 0.1.
+
+    Returns:
+      (bool [N, E], radius [N], a whole number of at least 1 that int32 holds).
+    """
+    numpy, limits = module_of(square), np.finfo(coordinates.dtype)
+    least = square.min(axis=1)
+    distance, rounding = numpy.sqrt(least), np.sqrt(coordinates.shape[1]) * limits.eps * numpy.abs(coordinates).max()
+    tie = _TIE + 4.0 * (limits.eps + rounding / numpy.sqrt(numpy.maximum(least, limits.tiny)))
+    is_nearest = (square <= (least * (1.0 + tie))[:, None]) & numpy.isfinite(square)
+    radius = numpy.ceil(distance - numpy.minimum(tie * distance, _NEVER_ROUNDING))
+    return is_nearest, numpy.clip(radius, 1.0, _FARTHEST)
 
 
 def no_votes(visited, policy) -> Votes:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxhom import checks
 from jaxhom.generalization import evidence
 from jaxhom.generalization.result import Generalization
-from jaxhom.generalization.votes import TIE, Votes, is_nearest, square_distances
+from jaxhom.generalization.votes import Votes, nearest, square_distances
 from jaxhom.generalization.voting import VotingRule
 from jaxhom.models.demonstrations import Demonstrations
 from jaxhom.models.graph import host_graph
@@ -155,10 +155,7 @@ def vote_of_nearest(mdp: MDP, start: Generalization, experts, coordinates) -> Vo
     everyone, chosen = jnp.arange(mdp.num_states)[:, None], _clipped(mdp, experts)
     counts = evidence.has_vote(mdp, start.policy, everyone, chosen) & (experts < mdp.num_states)
     square = jnp.where(counts, square_distances(coordinates, coordinates[chosen]), jnp.inf)
-    least = square.min(axis=1)
-    tie = TIE + _rounding(coordinates, least)
-    is_voter = is_nearest(square, tie[:, None]) & jnp.isfinite(least)[:, None]
-    radius = jnp.maximum(jnp.ceil(jnp.sqrt(least) * (1 - tie)), 1)
+    is_voter, radius = nearest(square, coordinates)
     return Votes(
         policy=evidence.policy_of_votes(mdp, sum_of_policies(is_voter, start.policy, experts))[0],
         radius=jnp.where(is_voter.any(axis=1), radius, -1).astype(jnp.int32),
@@ -170,13 +167,6 @@ def sum_of_policies(weights, policy, experts) -> jax.Array:
     """[S, A]: the sum of the demonstrated states' policies with weights [S, E]; booleans are 0 and 1."""
     policies = policy.at[experts].get(mode="fill", fill_value=0)
     return jnp.matmul(weights.astype(policy.dtype), policies, precision=jax.lax.Precision.HIGHEST)
-
-
-def _rounding(coordinates, least) -> jax.Array:
-    """[S]: the relative difference of two squares near the `least` that rounded coordinates [S, D] may have made."""
-    limits = jnp.finfo(coordinates.dtype)
-    difference = jnp.abs(coordinates).max() * coordinates.shape[1] ** 0.5 * limits.eps
-    return 4 * (limits.eps + difference / jnp.sqrt(jnp.maximum(least, limits.tiny)))
 
 
 def _grow(mdp: MDP, experts, accepted, asking, least: int) -> _Search:

@@ -17,6 +17,8 @@ from jaxhom.models.mdp import MDP
 if TYPE_CHECKING:
     from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
+_FAR = 1e150  # of coordinates: squares of larger ones are infinite
+
 
 def as_model(mdp: Any) -> MDP:
     """The model itself, or that of an environment or domain (whatever has it as `.mdp`); the doors' first line."""
@@ -98,13 +100,18 @@ def check_coordinates(mdp: MDP, coordinates: Float[ArrayLike, "S D"]) -> Float[n
     """Positions of the states, in any number D of dimensions, on the host; traced ones as they are.
 
     Raises:
-      ValueError: if they are not [S, D], or one is not finite.
+      ValueError: if they are not [S, D], or one is not finite, or so large that no distance is.
     """
     is_traced = checks.is_traced(coordinates)
     coordinates = coordinates if is_traced else checks.as_host_array("coordinates", coordinates)
     good = coordinates.ndim == 2 and len(coordinates) == mdp.num_states
     checks.require_shape("coordinates", coordinates, f"({mdp.num_states}, D)", good)
-    return coordinates if is_traced else checks.require_floats("coordinates", coordinates)
+    if is_traced:
+        return coordinates
+    coordinates = checks.require_floats("coordinates", coordinates)
+    is_near = np.abs(coordinates.astype(np.float64)) <= _FAR
+    checks.require_all("coordinates", coordinates, is_near, f"must not be above {_FAR:.0e} in size")
+    return coordinates
 
 
 def require_features(mdp: MDP) -> None:

@@ -4,6 +4,7 @@ import functools
 from typing import NamedTuple
 
 import chex
+import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
@@ -256,6 +257,32 @@ def test_euclidean(name, scale):
     np.testing.assert_array_equal(result.support, np.where(visited, 1, tied))
 
 
+@pytest.mark.parametrize(
+    ("dtype", "spacing", "offset"), [(np.float32, 1e3, 5e6), (np.float64, 0.1, 5e6), (np.float64, 0.1, 1e9)]
+)
+def test_ties_far_from_the_origin(dtype, spacing, offset):
+    """Map coordinates of a survey: a grid of some spacing, millions of metres away, rounded to the type."""
+    grid = gridworld(9)
+    corners_and_middle = Demonstrations.from_trajectories([([s], [k % 4]) for k, s in enumerate([0, 8, 40, 72, 80])])
+    near, far = (
+        nearest_neighbors(grid.mdp, corners_and_middle, metric="euclidean", coordinates=coordinates)
+        for coordinates in (grid.coordinates, (np.asarray(grid.coordinates) * spacing + offset).astype(dtype))
+    )
+    assert np.any(near.support > 1)
+    np.testing.assert_array_equal(far.support, near.support)
+    np.testing.assert_allclose(far.policy, near.policy, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_traced", [False, True])
+@pytest.mark.parametrize(("scale", "radius"), [(1e9, 1e9), (1e12, 2**31 - 128), (1e-9, 1)])
+def test_radii_hold_in_int32(scale, radius, is_traced):
+    mdp = MDP.from_dense(np.repeat(np.eye(2)[[1, 0]][:, None], 2, axis=1), discount=0.5)
+    demonstrations = Demonstrations.from_trajectories([([0], [1])])
+    learn = functools.partial(nearest_neighbors, metric="euclidean", coordinates=[[0.0], [scale]])
+    result = (jax.jit(learn) if is_traced else learn)(mdp, demonstrations)
+    assert result.radius.tolist() == [0, radius]
+
+
 def test_euclidean_in_three_dimensions():
     """By hand: state 3 has two nearest states, 0 and 1, with two actions each."""
     mdp = MDP.from_dense(np.repeat(np.eye(4)[[1, 2, 3, 0]][:, None], 2, axis=1), discount=0.5)
@@ -393,6 +420,7 @@ def test_options_of_algorithm_1_out_of_range_are_refused(options, message):
     [
         ({"metric": "manhattan"}, "metric must be .*, got 'manhattan'"),
         ({"metric": "euclidean"}, "needs coordinates"),
+        ({"metric": "euclidean", "coordinates": np.full((16, 1), -1e200)}, r"must not be above 1e\+150 in size"),
         ({"coordinates": np.zeros((15, 2))}, r"coordinates must have shape \(16, D\), got \(15, 2\)"),
         ({"coordinates": np.zeros(16)}, r"coordinates must have shape \(16, D\), got \(16,\)"),
         ({"coordinates": np.full((16, 2), np.nan)}, r"coordinates\[0, 0\] must be finite, got nan"),

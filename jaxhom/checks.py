@@ -43,8 +43,7 @@ def as_host_array(name: str, value: Any) -> np.ndarray:
     try:
         return np.asarray(value)
     except (TypeError, ValueError) as error:  # ragged nested lists, keys and other objects
-        reason = str(error).partition("\n")[0]
-        raise ValueError(f"{name} is not a rectangular array: {reason}") from None
+        raise ValueError(f"{name} is not a rectangular array: {first_line(error)}") from None
 
 
 def to_device(array: Any, dtype: DTypeLike | None = None) -> Array:
@@ -120,6 +119,11 @@ def warn(message: str, category: type[Warning]) -> None:
 def in_one_line(value: Any) -> str:
     """`repr` for messages: without line breaks, and cut off where it is long."""
     return " ".join(reprlib.repr(value).split())
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says; the name of its type where it says nothing."""
+    return str(error).strip().partition("\n")[0] or type(error).__name__
 
 
 def require_shape(name: str, array: Any, expected: str, condition: bool) -> None:
@@ -258,6 +262,29 @@ def require_count(name: str, value: Any, least: int = 1) -> int:
     if value < least:
         raise ValueError(f"{name} must be at least {least}, got {value}")
     return value
+
+
+def require_switch(name: str, value: Any) -> bool:
+    """Returns `value` if it is True or False; a text such as "no" is neither."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {in_one_line(value)}")
+    return bool(value)
+
+
+def require_function(name: str, value: Any) -> None:
+    """Raises unless `value` can be called."""
+    if not callable(value):
+        raise ValueError(f"{name} must be a function, got {in_one_line(value)}")
+
+
+def require_float_type(name: str, dtype: DTypeLike | None) -> None:
+    """Raises unless `dtype` is a floating-point type, or None."""
+    try:
+        is_float = dtype is None or jnp.issubdtype(jnp.dtype(dtype), jnp.floating)
+    except TypeError:
+        is_float = False
+    if not is_float:
+        raise ValueError(f"{name} must be a floating-point type such as jax.numpy.float32, got {in_one_line(dtype)}")
 
 
 def require_cell(name: str, cell: Any) -> tuple[int, int]:

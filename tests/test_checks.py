@@ -51,6 +51,18 @@ def test_values_in_messages_are_short_and_have_no_line_breaks(value):
     assert 0 < len(text) < 200 and "\n" not in text
 
 
+@pytest.mark.parametrize("value", ["no", None, 1, np.ones(1, bool)])
+def test_only_true_and_false_are_switches(value):
+    assert [checks.require_switch("mutual", given) for given in (True, np.False_)] == [True, False]
+    with pytest.raises(ValueError, match="mutual must be True or False, got"):
+        checks.require_switch("mutual", value)
+
+
+def test_the_first_line_of_an_error():
+    assert checks.first_line(ValueError("\n one\n two")) == "one"
+    assert checks.first_line(KeyboardInterrupt()) == "KeyboardInterrupt"
+
+
 def test_is_traced_sees_one_traced_leaf():
     seen = []
     jax.jit(lambda x: seen.append(checks.is_traced({"a": np.ones(2)}, (x, 3))))(1.0)

@@ -134,9 +134,7 @@ def _checked_options(l1, max_weight, nonnegative) -> dict:
         if not (good and np.isfinite(number)):
             range_ = "finite and not negative" if name == "l1" else "finite and positive"
             raise ValueError(f"{name} must be {range_}, got {number}")
-    if not isinstance(nonnegative, bool | np.bool_):
-        raise ValueError(f"nonnegative must be True or False, got {checks.in_one_line(nonnegative)}")
-    return {"penalty": penalty, "largest": largest, "nonnegative": bool(nonnegative)}
+    return {"penalty": penalty, "largest": largest, "nonnegative": checks.require_switch("nonnegative", nonnegative)}
 
 
 def _from_policy(mdp: MDP, policy: Float[np.ndarray, "S A"], options: dict) -> Learned:

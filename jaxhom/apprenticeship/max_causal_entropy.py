@@ -109,7 +109,7 @@ def max_causal_entropy(
     tolerance = _default_tolerance(mdp) if tolerance is None else checks.require_number("tolerance", tolerance)
     checks.require_positive("tolerance", tolerance)
     problem = Problem(
-        nonnegative=bool(nonnegative),
+        nonnegative=checks.require_switch("nonnegative", nonnegative),
         l1=_penalty("l1", l1),
         l2=_penalty("l2", l2),
         tolerance=tolerance,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import jax
 
-from jaxhom import interrupts, programs
+from jaxhom import checks, interrupts, programs
 from jaxhom.cli import ask, evaluate, explain, learn, main_job, plot
 from jaxhom.cli.options import Parser, add_cache_option
 
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return interrupts.say(*error.args * isinstance(error, KeyboardInterrupt))
         if not isinstance(error, OSError | ValueError | ImportError):
             raise
-        message = _of_file(error) if isinstance(error, OSError) else str(error).partition("\n")[0]
+        message = _of_file(error) if isinstance(error, OSError) else checks.first_line(error)
         print(f"jaxhom: error: {message}", file=sys.stderr)
         return 2
     return 0
@@ -55,5 +55,5 @@ def make_parser() -> Parser:
 def _of_file(error: OSError) -> str:
     """`name: what happened`, without the number."""
     if error.filename is None or error.strerror is None:
-        return str(error).partition("\n")[0]
-    return f"{error.filename}: {error.strerror}"
+        return checks.first_line(error)
+    return f"{error.filename or repr(error.filename)}: {error.strerror}"

@@ -92,6 +92,7 @@ def gridworld(
     row, column = checks.require_cell("start", start)
     if not (0 <= row < size and 0 <= column < size):
         raise ValueError(f"start must be a cell of the {size} x {size} grid, got {tuple(start)}")
+    checks.require_float_type("dtype", dtype)
     coordinates = np.stack(np.divmod(np.arange(size * size), size), axis=-1)
     region, features = np.zeros(size * size, np.int64), None
     if num_regions is not None:

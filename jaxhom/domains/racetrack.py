@@ -142,6 +142,7 @@ def racetrack(
 
     Source: Boularias and Chaib-draa 2010, section VI.B.
     """
+    checks.require_float_type("dtype", dtype)
     if start is None and isinstance(track, str):
         start = SHIPPED_STARTS.get(track)
     rows = read_map(track)

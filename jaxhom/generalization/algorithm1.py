@@ -117,7 +117,8 @@ def soft_local_homomorphism(
         table = similarity
     fixed = {"distance": distance, "anchored": anchored, "mutual": mutual}
     checks.refuse_traced(**fixed, labels=labels, label_weight=label_weight)
-    rule = VotingRule(threshold, bool(mutual), tolerance, voters, weights, temperature)
+    anchored = checks.require_switch("anchored", anchored)
+    rule = VotingRule(threshold, checks.require_switch("mutual", mutual), tolerance, voters, weights, temperature)
     mdp = as_model(mdp)
     is_traced = checks.is_traced(mdp, demonstrations, states)
     if is_traced and table is None:

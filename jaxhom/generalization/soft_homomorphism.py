@@ -141,6 +141,7 @@ def soft_homomorphism(
     homomorphisms are Sorg and Singh's (2009).
     """
     checks.refuse_traced(anchored=anchored)
+    anchored = checks.require_switch("anchored", anchored)
     effort = require_effort(tolerance, max_iterations, progress)
     mdp = as_model(mdp)
     if not isinstance(demonstrations, Demonstrations):

@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 _NUMBERS_AT_A_TIME = 2**22  # values of all times that are held together
 
 
+def discounted_away(discount: float) -> int:
+    """The number of steps after which nothing counts any more, whatever the rewards: gamma^t / (1 - gamma) = 2^-200."""
+    return int(np.ceil((-200.0 * np.log(2.0) + np.log1p(-discount)) / np.log(discount)))
+
+
 def best(choices: Choices, horizon: int) -> BestChoices:
     """What the best policies of the first `horizon` steps are worth; one policy's worth, if every state is fixed."""
     largest = nothing = np.zeros(len(choices.size))

@@ -149,7 +149,8 @@ def loss_bound(
         policy = np.asarray(check_policy(mdp, policy))
         checks.require_shape("policy", policy, "(B, S, A) with B >= 1", len(policy) > 0)
         weights = None if weights is None else _checked_weights(mdp, weights)
-        horizon = None if horizon is None else checks.require_count("horizon", horizon)
+        if horizon is not None:  # after so many steps sums do not change any more
+            horizon = min(checks.require_count("horizon", horizon), first_steps.discounted_away(float(mdp.discount)))
         agreeing = Agreeing(mdp, demonstrations, horizon, progress)
         lanes = [agreeing.loss(one, weights) for one in policy.reshape(-1, *policy.shape[-2:])]
         return (

@@ -20,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxhom import checks
-from jaxhom.interop.archives import FileError, read_archive, require_arrays, whole_file, write_archive
+from jaxhom.interop.archives import FileError, read_archive, readable_reason, require_arrays, whole_file, write_archive
 from jaxhom.models.inputs import as_model, check_states
 from jaxhom.models.mdp import MDP
 from jaxhom.similarity.brackets import LocalSimilarity
@@ -178,8 +178,7 @@ class AllBrackets:
         except FileNotFoundError:
             raise FileError(f"{path}: not made yet; save_all_brackets goes on with what is missing") from None
         except (OSError, ValueError, EOFError) as error:
-            reason = str(error).partition("\n")[0]
-            raise FileError(f"{path}: not a readable .npy file ({reason})") from None
+            raise FileError(f"{path}: not a readable .npy file ({readable_reason(error)})") from None
         expected = len(self.pairs_of(shard))
         if not isinstance(rows, np.ndarray) or rows.dtype != self.row_type or rows.shape != (expected,):
             raise FileError(f"{path}: not the brackets of {expected} pairs as {self.row_type}")

@@ -13,6 +13,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from jaxhom import checks
+
 FORMAT_VERSION = 1
 
 
@@ -105,8 +107,12 @@ def _archive(path: str | os.PathLike) -> Iterator[np.lib.npyio.NpzFile]:
     except FileError:
         raise
     except Exception as error:  # of damaged headers NumPy and the standard library raise what they come upon
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise FileError(f"{path}: not a readable .npz archive ({reason})") from None
+        raise FileError(f"{path}: not a readable .npz archive ({readable_reason(error)})") from None
+
+
+def readable_reason(error: Exception) -> str:
+    """Why NumPy does not read a file; what is no file of NumPy's at all it takes for a pickle, and names a remedy."""
+    return "it is no file of NumPy's" if "pickle" in str(error) else checks.first_line(error)
 
 
 def _array(path: str | os.PathLike, archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxhom import checks
+
 if TYPE_CHECKING:
     import gymnasium
 
@@ -50,7 +52,7 @@ def make_environment(name: str, **options: Any) -> gymnasium.Env:
             _require_options(gymnasium, name, options)
             return gymnasium.make(name, **options)
     except gymnasium.error.Error as error:
-        reason = str(error).partition("\n")[0]
+        reason = checks.first_line(error)
     except _OptionError as error:
         raise ValueError(f"environment {name!r}: {error}") from None
     except Exception as error:  # constructors raise what they come upon

@@ -52,7 +52,7 @@ def read_table(env: gymnasium.Env) -> TransitionTable:
             f"{name_of(env)} has no transition table P: record transitions in it, and estimate a model with "
             "jaxhom.interop.from_samples"
         )
-    entries, allowed = _entries(_rows(table, name_of(env)))
+    entries, allowed = _entries(_rows(table, name_of(env), getattr(getattr(env, "action_space", None), "n", None)))
     probability, next_state, reward, terminated = np.moveaxis(entries, -1, 0)
     probability = checks.require_distribution("P: probability", probability, None if allowed.all() else allowed)
     next_state = checks.require_integers("P: next state", next_state, upper=len(entries))
@@ -79,14 +79,18 @@ def _entries(rows: list[list]) -> tuple[np.ndarray, np.ndarray]:
     return entries, allowed
 
 
-def _rows(table, name: str) -> list[list]:
+def _rows(table, name: str, most: int | None) -> list[list]:
     """The table as nested lists, whatever it is kept in: states 0 ... S-1, each with actions 0 ... A-1.
 
-    Where a state lacks an action (a dictionary without it, or no outcomes), its list is empty.
+    Where a state lacks an action (a dictionary without it, or no outcomes), its list is empty. `most` is how many
+    actions the environment has, if it says so.
     """
     try:
         num_states = len(table)
+        for s in range(num_states):
+            _require_actions(table[s], f"P[{s}] of {name}", most)
         num_actions = max((_num_actions(table[s]) for s in range(num_states)), default=0)
+        checks.require_slots(num_states, num_actions, 1)
         rows = [[list(_outcomes(table[s], a)) for a in range(_num_actions(table[s]))] for s in range(num_states)]
     except (TypeError, KeyError, IndexError) as error:
         raise ValueError(
@@ -96,6 +100,14 @@ def _rows(table, name: str) -> list[list]:
     if not num_states or not num_actions:
         raise ValueError(f"P of {name} must have at least one state and one action")
     return [row + [[] for _ in range(num_actions - len(row))] for row in rows]
+
+
+def _require_actions(actions, where: str, most: int | None) -> None:
+    """Raises where a dictionary has an action that cannot be one of 0, 1, ..., `most` - 1."""
+    for action in actions if isinstance(actions, Mapping) else ():
+        if action < 0 or (most is not None and action >= most):
+            range_ = "from 0 on" if most is None else f"from 0 to {most - 1}"
+            raise ValueError(f"{where} has an action {checks.in_one_line(action)}: actions are numbered {range_}")
 
 
 def _num_actions(actions) -> int:

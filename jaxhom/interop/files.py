@@ -175,6 +175,7 @@ def save_mdp(path: str | os.PathLike, mdp: MDP) -> None:
     Names that Python writes as literals (texts, numbers, tuples of them) come back as they are, others as their texts.
 
     Raises:
+      ValueError: if two names have the same text, and neither is a literal.
       OSError: if the file cannot be written.
 
     Outside jit, vmap and grad only.

@@ -3,7 +3,7 @@
 texts [N]             names that are texts
 integers [N]          whole numbers
 integers [N, D]       tuples of D whole numbers, such as (row, column)
-texts [N, 1]          whatever else Python writes as a literal: ("kitchen", 2), None, 0.5, True
+texts [N, 1]          literals of Python: ("kitchen", 2), None, 0.5, True; other names as literals of their texts
 """
 
 from __future__ import annotations
@@ -18,7 +18,11 @@ from jaxhom.models.names import Names
 
 
 def names_as_array(names: Names) -> np.ndarray:
-    """The names in the first of the module's forms that gives them back; their texts if none does."""
+    """The names in the first of the module's forms that holds them.
+
+    Raises:
+      ValueError: if two of them would come back as the same text.
+    """
     if all(type(name) is str and not name.endswith("\0") for name in names):  # NumPy pads texts with NUL
         return np.array(names)
     if all(_is_index(name) for name in names):
@@ -26,10 +30,13 @@ def names_as_array(names: Names) -> np.ndarray:
     is_place = all(type(name) is tuple and name and all(map(_is_index, name)) for name in names)
     if is_place and len({len(name) for name in names if isinstance(name, tuple)}) == 1:
         return np.array(names, np.int64)
-    literals = [repr(name) for name in names]
-    if all(_literal(text) == name for text, name in zip(literals, names, strict=True)):
-        return np.array(literals)[:, None]
-    return np.array([str(name) for name in names])
+    literals = [repr(name) if _literal(repr(name)) == name else repr(str(name)) for name in names]
+    first: dict[str, int] = {}
+    for number, text in enumerate(literals):
+        if first.setdefault(text, number) != number:
+            twins = f"{checks.in_one_line(names[first[text]])} and {checks.in_one_line(names[number])}"
+            raise ValueError(f"a file cannot tell the names {twins} apart: both would be {text}")
+    return np.array(literals)[:, None]
 
 
 def names_of(argument: str, array: np.ndarray) -> list[Hashable]:

@@ -287,8 +287,7 @@ def _by_networkx(path: str | os.PathLike, what: str, read: Callable[[Any], Any])
     try:
         return read(networkx)
     except Exception as error:  # of damaged files networkx and the XML parser raise what they come upon
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise FileError(f"{path}: not a readable {what} ({reason})") from None
+        raise FileError(f"{path}: not a readable {what} ({checks.first_line(error)})") from None
 
 
 def _columns(path: str | os.PathLike) -> tuple[list, list, np.ndarray | None]:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxhom import checks
 from jaxhom.interop.archives import FileError
 
 
@@ -37,7 +38,7 @@ def arrow_columns(paths: Sequence[pathlib.Path], is_wanted: Callable[[str], bool
         except FileNotFoundError:
             raise FileError(f"{path}: no such file") from None
         except (pyarrow.ArrowException, OSError) as error:
-            raise FileError(f"{path}: not a readable Arrow file ({_first_line(error)})") from None
+            raise FileError(f"{path}: not a readable Arrow file ({checks.first_line(error)})") from None
     return _columns(pyarrow.concat_tables(tables), is_wanted)
 
 
@@ -47,7 +48,7 @@ def parquet_columns(path: pathlib.Path, is_wanted: Callable[[str], bool]) -> Col
     try:
         table = _library("pyarrow.parquet", path).read_table(str(path))
     except (pyarrow.ArrowException, OSError) as error:
-        raise FileError(f"{path}: not a readable Parquet file ({_first_line(error)})") from None
+        raise FileError(f"{path}: not a readable Parquet file ({checks.first_line(error)})") from None
     return _columns(table, is_wanted)
 
 
@@ -62,7 +63,7 @@ def hdf5_columns(path: pathlib.Path, is_wanted: Callable[[str], bool]) -> Column
                 return [_group(file[name], is_wanted) for name in ordered]
             return Columns(_group(file, is_wanted), list(file))
     except OSError as error:
-        raise FileError(f"{path}: not a readable HDF5 file ({_first_line(error)})") from None
+        raise FileError(f"{path}: not a readable HDF5 file ({checks.first_line(error)})") from None
 
 
 def _group(group: Any, is_wanted: Callable[[str], bool]) -> dict[str, Any]:
@@ -91,7 +92,3 @@ def _library(name: str, path: pathlib.Path) -> Any:
     except ImportError:
         needed = name.partition(".")[0]
         raise ImportError(f"{path}: {needed} is needed to read it: pip install 'jaxhom[files]'") from None
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0] or type(error).__name__

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom import checks
-from jaxhom.models.demonstrations import Demonstrations
+from jaxhom.models.demonstrations import Demonstrations, require_demonstrations
 from jaxhom.models.mdp import MDP
 from jaxhom.models.stacking import as_models, require_alike
 from jaxhom.status import Record
@@ -49,7 +49,7 @@ class DisjointUnion(Record):
         Raises:
           ValueError: if there is no such part, or naming the first concrete state that it does not have.
         """
-        number = self._number(part)
+        number, demonstrations = self._number(part), require_demonstrations(demonstrations)
         if not checks.is_traced(demonstrations, self.offsets):
             inside = self.states(part)
             _require_states(demonstrations, inside.stop - inside.start)

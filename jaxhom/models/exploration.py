@@ -54,6 +54,7 @@ def explore(
     progress: bool,
 ) -> Explored:
     """Explores all that can be reached; arguments and errors are those of `MDP.from_function`."""
+    checks.require_function("successors", successors)
     max_states = checks.require_count("max_states", max_states)
     found = _Found(max_states)
     weights = _start(found, start)
@@ -119,6 +120,7 @@ def features_of(features: Callable[[Any, Any], Sequence[float]], explored: Explo
     Raises:
       ValueError: naming state and action of the first pair whose features are no K numbers.
     """
+    checks.require_function("features", features)
     rows, table = np.unique(explored.pair), np.zeros((len(explored.states), len(explored.actions), 0))
     for pair in rows.tolist():
         state, action = divmod(pair, len(explored.actions))

@@ -111,7 +111,7 @@ def evaluate_exactly(
         terminal,
         events,
         horizon=checks.require_count("horizon", horizon),
-        count_terminal_step=bool(count_terminal_step),
+        count_terminal_step=checks.require_switch("count_terminal_step", count_terminal_step),
     )
 
 
@@ -173,11 +173,12 @@ def evaluate_by_sampling(
     policy, reward, terminal, events = _validated(mdp, policy, reward, terminal, events)
     horizon = checks.require_count("horizon", horizon)
     num_trials = checks.require_count("num_trials", num_trials, least=2)
+    count_terminal_step = checks.require_switch("count_terminal_step", count_terminal_step)
 
     def evaluate(policy, reward):
         # One state more than steps: the last step of a trial may be the one that finishes it.
         trials = sample_demonstrations(key, mdp, policy, num_trials, horizon + 1)
-        return _evaluate_trials(trials, reward, terminal, events, count_terminal_step=bool(count_terminal_step))
+        return _evaluate_trials(trials, reward, terminal, events, count_terminal_step=count_terminal_step)
 
     if policy.ndim == 3:
         evaluate = jax.vmap(evaluate, in_axes=(0, 0 if reward.ndim == 3 else None))

@@ -40,6 +40,7 @@ from jaxhom.plotting.style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SIGNS
 if TYPE_CHECKING:
     from jaxtyping import ArrayLike, Bool, Int
 
+_TONES = 250  # of levels: where there are more, neighbours share one
 _NOTHING, _DEMONSTRATED = -1, 0
 _MIXED = 0  # no action has more than half of the probability
 _ARROWS = {"up": "\N{UPWARDS ARROW}", "down": "\N{DOWNWARDS ARROW}", "left": "\N{LEFTWARDS ARROW}"}
@@ -170,6 +171,8 @@ def plot_generalization(
       >>> print(*(panel.get_title(loc="left") for panel in plot_generalization(world, general)))
       radius support policy
     """
+    if not all(hasattr(general, name) for name in ("policy", "visited", "radius", "support")):
+        raise ValueError(f"general must be a jaxhom.Generalization, got {type(general).__name__}")
     board = board_of(domain)
     mosaic = speed is None and board.per_cell > 1
     policy = require("policy", general.policy, (board.num_states, len(board.moves)))
@@ -199,9 +202,10 @@ def _at_speed(board: Board, values: np.ndarray, speed) -> np.ndarray:
 def _draw_levels(ax: Axes, board: Board, levels: np.ndarray, units: tuple[str, str]) -> Axes:
     """Colours [C] or [S] by level: -1 nothing found, 0 demonstrated, 1, 2, ... on a scale of their own."""
     largest = max(int(levels.max()), 1)
-    tones = plt.get_cmap("cividis_r")(np.linspace(0.0, 1.0, largest))
+    tones = plt.get_cmap("cividis_r")(np.linspace(0.0, 1.0, min(largest, _TONES)))
     palette = colors.ListedColormap([colors.to_rgba(PURPLE), colors.to_rgba(VERMILLION), *tones])
-    show(ax, board, levels, cmap=palette, norm=colors.BoundaryNorm(np.arange(-1, largest + 2) - 0.5, palette.N))
+    bounds = np.append([-1.5, -0.5], np.linspace(0.5, largest + 0.5, len(tones) + 1))
+    show(ax, board, levels, cmap=palette, norm=colors.BoundaryNorm(bounds, palette.N))
     _level_bar(ax, board, palette, largest, units)
     _draw_signs(ax, board, levels)
     if board.side(levels) > 1:
@@ -212,7 +216,7 @@ def _draw_levels(ax: Axes, board: Board, levels: np.ndarray, units: tuple[str, s
 def _level_bar(ax: Axes, board: Board, palette, largest: int, units: tuple[str, str]) -> None:
     """The colour bar of levels; on it the first two are as wide as their names need, however many others there are."""
     width = max(1.0, largest / 10)
-    bounds = np.append([0.5 - 2 * width, 0.5 - width], np.arange(largest + 1) + 0.5)
+    bounds = np.append([0.5 - 2 * width, 0.5 - width], np.linspace(0.5, largest + 0.5, palette.N - 1))
     mappable = ScalarMappable(colors.BoundaryNorm(bounds, palette.N), palette)
     bar = colorbar(ax, board, mappable, "", spacing="proportional")
     ticks = np.arange(1, largest + 1, -(-largest // 8))

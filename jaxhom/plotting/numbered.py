@@ -207,4 +207,6 @@ def _show_names(
     if len(names) <= _NAMED:
         texts = [str(name) for name in names]
         is_long = is_upright and sum(map(len, texts)) > _LETTERS
-        axis.set_ticks(range(len(texts)), labels=texts, rotation=90 if is_long else 0)
+        # A dollar in a name is a dollar, and what no font has is written out.
+        texts = [text.encode("utf-8", "backslashreplace").decode() for text in texts]
+        axis.set_ticks(range(len(texts)), labels=texts, rotation=90 if is_long else 0, parse_math=False)

@@ -35,7 +35,7 @@ def table_for(
         raise ValueError(f"table must be a SimilarityTable, got {type(table).__name__}")
     if not _same_transitions(table.mdp, as_model(mdp)):
         raise ValueError("table was made for another model")
-    if (table.distance, table.anchored) != (distance, bool(anchored)):
+    if (table.distance, table.anchored) != (distance, anchored):
         raise ValueError(
             f"table was made with distance={table.distance} and anchored={table.anchored}, "
             f"not with distance={distance} and anchored={anchored}"

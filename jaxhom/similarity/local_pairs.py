@@ -114,7 +114,7 @@ def local_similarity(
     options = {"tolerance": tolerance, "method": method, "max_iterations": max_iterations}
     checks.refuse_traced(distance=distance, anchored=anchored, **options)
     pairs = _Pairs.checked(mdp, sources, targets, target_mdp, labels, target_labels, label_weight)
-    kind = {"distance": distance, "anchored": anchored}
+    kind = {"distance": distance, "anchored": checks.require_switch("anchored", anchored)}
     if pairs.is_traced:
         return pairs.brackets_in_program(Goal.checked(**options), table, name="local_similarity", **kind)
     known, sources, targets = pairs.on_host(table, **kind)
@@ -181,7 +181,8 @@ def locally_similar(
     options = {"tolerance": tolerance, "threshold": threshold}
     checks.refuse_traced(distance=distance, anchored=anchored, mutual=mutual, **options)
     pairs = _Pairs.checked(mdp, sources, targets, target_mdp, labels, target_labels, label_weight)
-    kind = {"distance": distance, "anchored": anchored}
+    mutual = checks.require_switch("mutual", mutual)
+    kind = {"distance": distance, "anchored": checks.require_switch("anchored", anchored)}
     if pairs.is_traced:
         kind |= {"name": "locally_similar", "table": table}
         ways = [pairs, pairs.turned()][: 1 + mutual]

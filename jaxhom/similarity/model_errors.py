@@ -64,6 +64,7 @@ def homomorphism_error(
     Source: Boularias and Chaib-draa 2010, eq. (9).
     """
     source, target = checks.require_model_pair(source, target)
+    anchored = checks.require_switch("anchored", anchored)
     if (source_labels is None) != (target_labels is None):
         raise ValueError("source_labels and target_labels must be given together")
     labels = () if source_labels is None else _checked_labels(source, target, source_labels, target_labels)

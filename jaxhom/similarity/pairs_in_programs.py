@@ -73,7 +73,7 @@ def brackets_in_program(
     if goal.method == "auto":
         goal = goal._replace(method="pdhg")
     models = *transitions, () if labels[0] is None else tuple(labels)
-    found = differentiable_bounds(models, tuple(sizes), goal, bool(anchored), name)
+    found = differentiable_bounds(models, tuple(sizes), goal, anchored, name)
     return found.replace(lower=not_negative(found.lower))
 
 

@@ -69,7 +69,7 @@ def homomorphism_map(
     if not regularization > 0:
         raise ValueError(f"regularization must be positive, got {regularization}")
     dtype = jnp.promote_types(jnp.result_type(source, target), jnp.float32)
-    return _map(source.astype(dtype), target.astype(dtype), regularization, bool(anchored))
+    return _map(source.astype(dtype), target.astype(dtype), regularization, checks.require_switch("anchored", anchored))
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))

@@ -126,11 +126,15 @@ class SimilarityTable:
         self.mdp = as_model(mdp)
         require_concrete(self.mdp)
         checks.refuse_traced(labels=labels, label_weight=label_weight)
-        self.distance, self.anchored = checks.require_count("distance", distance), bool(anchored)
+        self.distance = checks.require_count("distance", distance)
+        self.anchored = checks.require_switch("anchored", anchored)
         self.labels = None if labels is None else check_labels(self.mdp, labels, label_weight)
         if labels is None and checks.require_number("label_weight", label_weight) != 1.0:
             raise ValueError(f"label_weight is {checks.in_one_line(label_weight)}, and there are no labels")
-        self.given_relation, self.across_processes = relation, bool(across_processes)
+        self.given_relation, self.across_processes = (
+            relation,
+            checks.require_switch("across_processes", across_processes),
+        )
         if across_processes and self.renames:
             raise ValueError('relation="lax" is not shared by processes: give each a table of its own')
         self._maker = LocalModelMaker(host_graph(self.mdp), self.distance, self.labels)

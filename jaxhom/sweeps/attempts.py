@@ -98,7 +98,11 @@ def _checked(result: Any, case: Any) -> dict[str, Plain]:
 
 
 def _failed(error: BaseException) -> dict[str, Plain]:
-    return {"error": _in_one_line(f"{type(error).__name__}: {error}")}
+    try:
+        text = str(error)
+    except Exception:  # of classes whose texts cannot be made
+        text = "its text cannot be made"
+    return {"error": _in_one_line(f"{type(error).__name__}: {text}")}
 
 
 def _in_one_line(text: str) -> str:

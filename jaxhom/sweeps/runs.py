@@ -110,8 +110,9 @@ def run_jobs(
     progress: bool = True,
 ) -> None:
     """As `run`, of cases that have been checked, into rows of any kind."""
-    if not callable(work):
-        raise ValueError(f"work must be a function, got {checks.in_one_line(work)}")
+    checks.require_function("work", work)
+    if group is not None:
+        checks.require_function("group", group)
     in_flight = None if in_flight is None else checks.require_count("in_flight", in_flight)
     with rows.writing():
         done = rows.done(retry)

@@ -376,6 +376,13 @@ def test_dtype_is_the_default_unless_given():
     assert racetrack(STRAIGHT, dtype=half).mdp.dtype == gridworld(4, dtype=half).mdp.dtype == half
 
 
+@pytest.mark.parametrize("dtype", [np.int32, bool, "nope"])
+def test_models_are_of_floats(dtype):
+    for make in (gridworld, racetrack):
+        with pytest.raises(ValueError, match="dtype must be a floating-point type such as jax.numpy.float32, got"):
+            make(4 if make is gridworld else STRAIGHT, dtype=dtype)
+
+
 def test_domains_are_pytrees():
     for domain in (racetrack(STRAIGHT), gridworld(4, num_regions=4)):
         leaves, structure = jax.tree.flatten(domain)

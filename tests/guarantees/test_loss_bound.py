@@ -211,6 +211,8 @@ def test_features_one_at_a_time(rng, monkeypatch):
 def test_many_steps_are_all_time(rng):
     given = problem(rng, "stochastic")
     few = loss_bound(given.mdp, given.demonstrations, given.policy, horizon=400)
+    many = loss_bound(given.mdp, given.demonstrations, given.policy, horizon=2**70)
+    np.testing.assert_allclose(many.bound, few.bound, rtol=1e-12)
     forever = loss_bound(given.mdp, given.demonstrations, given.policy)
     np.testing.assert_allclose(few.gaps, forever.gaps, rtol=0, atol=1e-8)
     np.testing.assert_allclose(few.contributions, forever.contributions, rtol=0, atol=1e-8)

@@ -1,5 +1,6 @@
 """Files: what is saved comes back bit by bit; what is damaged, foreign or newer is one clear line."""
 
+import fractions
 import re
 import zipfile
 
@@ -292,6 +293,8 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
         ([2.5, "2.5"], (2.5, "2.5")),
         ([(), (0,)], ((), (0,))),
         ([frozenset("a"), object], ("frozenset({'a'})", "<class 'object'>")),
+        ([frozenset("a"), 0.25], ("frozenset({'a'})", 0.25)),
+        ([1, float("nan")], (1, "nan")),
     ],
 )
 def test_names_come_back(tmp_path, names, back):
@@ -300,6 +303,14 @@ def test_names_come_back(tmp_path, names, back):
     loaded = load_mdp(path)
     assert loaded.state_names == back and loaded.action_names == ("a",)
     assert [type(name) for name in loaded.state_names] == [type(name) for name in back]
+
+
+def test_names_that_a_file_would_not_tell_apart_are_refused(tmp_path):
+    names = ["1/2", fractions.Fraction(1, 2)]
+    model = jaxhom.MDP.from_dense(np.full((2, 1, 2), 0.5), discount=0.9, state_names=names)
+    with pytest.raises(ValueError, match=r"tell the names '1/2' and Fraction\(1, 2\) apart: both would be '1/2'"):
+        save_mdp(tmp_path / "model.npz", model)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

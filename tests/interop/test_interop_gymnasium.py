@@ -46,8 +46,8 @@ def env(request):
         yield made
 
 
-def toy(table, initial=(1.0, 0.0)):
-    return types.SimpleNamespace(P=table, initial_state_distrib=np.array(initial))
+def toy(table, initial=(1.0, 0.0), **attributes):
+    return types.SimpleNamespace(P=table, initial_state_distrib=np.array(initial), **attributes)
 
 
 def table_values(table):
@@ -296,6 +296,11 @@ GOOD = {0: {0: [(1.0, 1, 0.0, True)]}, 1: {0: [(1.0, 1, 0.0, True)]}}
         (toy({0: {}, 1: {}}), "at least one state and one action"),
         (toy({1: GOOD[0], 2: GOOD[1]}), r"as P\[state\]\[action\], both numbered from 0: KeyError 0"),
         (toy(3), r"as P\[state\]\[action\]"),
+        (toy({**GOOD, 0: {-1: [], **GOOD[0]}}), r"P\[0\] of .* has an action -1: actions are numbered from 0 on"),
+        (
+            toy({**GOOD, 1: {10**9: GOOD[1][0]}}, action_space=gymnasium.spaces.Discrete(2)),
+            r"P\[1\] of .* has an action 1000000000: .* from 0 to 1",
+        ),
         (toy({**GOOD, 0: {0: [0.5, 0.5]}}), r"P\[0\]\[0\]\[0\] must be \(probability, next state, .*got 0.5"),
         (toy({**GOOD, 0: {0: [np.eye(3)]}}), r"P\[0\]\[0\]\[0\] must be"),
         (toy({**GOOD, 0: {0: [(1.0, 1, 0.0)]}}), r"P\[0\]\[0\]\[0\] must be"),

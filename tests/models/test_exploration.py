@@ -87,6 +87,8 @@ def test_dtypes_of_python_and_numpy_are_taken():
         ({"successors": lambda s: {"a": [(1.0, s, 0.0)]}}, "outcomes must be a list of pairs .* among them"),
         ({"successors": lambda s: ["a"]}, r"successors\('x'\) must be a mapping from actions to outcomes"),
         ({"successors": lambda s: None}, "there are no actions"),
+        ({"successors": [1]}, r"successors must be a function, got \[1\]"),
+        ({"features": np.ones((1, 1, 1))}, "features must be a function, got array"),
         (
             {"successors": lambda s: {"a": [(1.0, s + "x")]}, "max_states": 3},
             "more than 3 states can be reached, 'xxxx' the last of them: pass a larger max_states",

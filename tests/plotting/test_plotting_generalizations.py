@@ -129,6 +129,16 @@ def test_many_levels_leave_room_for_the_names_of_the_first_two(world, ax):
     assert len(ticks) <= 10
 
 
+@pytest.mark.parametrize("largest", [300, 2**31 - 1])
+def test_radii_in_metres_share_tones(largest, world, ax):
+    radius = np.linspace(-1, largest, GRID).round()
+    plotting.plot_radius(world, radius, ax=ax)
+    ax.figure.canvas.draw()
+    numbers = ax.images[0].norm(radius)
+    assert numbers[0] == 0 and numbers[-1] == ax.images[0].cmap.N - 1
+    assert np.all(np.diff(numbers) > 0)
+
+
 def test_three_panels_of_a_gridworld(world):
     demonstrations = Demonstrations.from_trajectories([([0, 1, 5], [3, 1, 1])])
     general = nearest_neighbors(world.mdp, demonstrations)
@@ -237,6 +247,10 @@ MALFORMED = {
             t, made_up(t, np.ones(STATES, int), np.ones(STATES, int)), speed=(0, 3)
         ),
         "speed must be",
+    ),
+    "a policy": (
+        lambda w, t: plotting.plot_generalization(w, np.ones((GRID, 4)) / 4),
+        "must be a jaxhom.Generalization",
     ),
     "one panel": (
         lambda w, t: plotting.plot_generalization(w, made_up(w, np.ones(GRID, int), np.ones(GRID, int)), ax=[None]),

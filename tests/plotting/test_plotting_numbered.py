@@ -93,6 +93,9 @@ def test_few_states_and_actions_are_called_by_their_names():
     drawn = plotting.plot_policy_by_state(POLICY, **names)
     assert [label.get_text() for label in drawn.get_xticklabels()] == ["door", "room", "(0, 1)"]
     assert [label.get_text() for label in drawn.get_yticklabels()] == ["stay", "go"]
+    odd = plotting.plot_policy_by_state(POLICY, state_names=["$100_$200", "$x$", "\ud800"])
+    odd.figure.canvas.draw()
+    assert [label.get_text() for label in odd.get_xticklabels()] == ["$100_$200", "$x$", "\\ud800"]
     many = plotting.plot_occupancy_by_state(np.ones(100), state_names=range(1000, 1100))
     assert "1000" not in [label.get_text() for label in many.get_xticklabels()]
     with pytest.raises(ValueError, match="state_names must be 3 names, got 2"):

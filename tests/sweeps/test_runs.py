@@ -141,6 +141,19 @@ def test_work_may_say_itself_that_a_case_failed(file):
     assert run(lambda case: {"steps": 8}, [{"x": 1}], file, retry=True)[0]["error"] is None
 
 
+class Unspeakable(Exception):
+    def __str__(self):
+        return self.args[0]  # a number
+
+
+def test_an_error_without_a_text_is_an_error(file):
+    def fail(case):
+        raise Unspeakable(7)
+
+    rows = run(fail, NUMBERS[:2], file)
+    assert [row["error"] for row in rows] == ["Unspeakable: its text cannot be made"] * 2
+
+
 def test_an_exit_is_an_error(file):
     def leaves(case):
         raise SystemExit(2)
@@ -250,6 +263,7 @@ def test_bad_cases_are_refused_before_anything_is_written(file, message):
         ({"executor": True}, "executor must be a whole number, got True"),
         ({"in_flight": 0}, "in_flight must be at least 1"),
         ({"work": 3}, "work must be a function, got 3"),
+        ({"group": 1}, "group must be a function, got 1"),
         ({"group": lambda case: [1]}, r"group\(case\) must be hashable, got \[1\]"),
         (
             {"executor": 2, "work": threading.Lock().acquire},

@@ -18,7 +18,6 @@ import numpy as np
 from jaxhom.apprenticeship.columns import solve_by_columns
 from jaxhom.apprenticeship.interior_point import LinearProgram, is_banded, solve_by_interior_point
 from jaxhom.apprenticeship.pdhg import solve_by_pdhg
-from jaxhom.apprenticeship.prepared import PreparedModel
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found
 from jaxhom.apprenticeship.stages import in_turn
@@ -28,8 +27,9 @@ from jaxhom.models.mdp import MDP
 _MANY_FEATURES = 16  # fewer mix few policies: one lane of racetrack_a, with 2, takes columns a fiftieth of the time
 _MANY_LANES = 8  # from which PDHG begins: grid24 takes 30 ms a lane so, 54 without it; fewer do not pay for compiling
 _SAME = 1e-9  # relative difference of sums that are the same
-_SMALL_WORK, _SMALL_STATES = 2e6, 1024  # multiplications of a step, and states, up to which the interior point begins:
-# one lane of grid16 takes it 5 to 7 steps, 22 to 31 ms, where columns that begin with a policy take up to 145 ms
+_SMALL_WORK, _SMALL_STATES = 3.5e7, 1024  # multiplications of a step of all lanes, and states, up to which the interior
+# point begins: alone lanes of grid24, grid32 and bumps24 take 56, 110 and 133 ms so, and 116, 158 and 169 if columns
+# begin; four lanes of grid24 72 and 80 ms each, but seven 54 and 41, since columns are shared
 
 
 def solve_by_the_quickest(request: Request) -> Found:
@@ -38,7 +38,7 @@ def solve_by_the_quickest(request: Request) -> Found:
     if mdp.dtype != jnp.float64 or mdp.num_features < _MANY_FEATURES or not is_banded(model):
         return solve_by_columns(request)
     is_few = len(request.lanes) < _MANY_LANES
-    if is_few and request.weights is None and _is_small(model) and not _are_a_policys(request):
+    if is_few and request.weights is None and _is_small(request) and not _are_a_policys(request):
         return in_turn(request, solve_by_interior_point, solve_by_columns)
     is_guided = request.policy is not None or request.weights is not None
     if is_guided or model.once(_most_features_of_a_pair) > 1 or _are_a_policys(request):
@@ -68,9 +68,10 @@ def _sum_of_features(mdp: MDP) -> float:
     return float(total[0]) if np.ptp(total) <= _SAME * np.abs(total).max() else np.nan
 
 
-def _is_small(model: PreparedModel) -> bool:
-    """Whether a step of the interior point takes a few milliseconds."""
-    return model.mdp.num_states <= _SMALL_STATES and model.once(LinearProgram).work <= _SMALL_WORK
+def _is_small(request: Request) -> bool:
+    """Whether steps of the interior point take a few milliseconds each, and the lanes are too few to share columns."""
+    model, lanes = request.model, len(request.lanes)
+    return model.mdp.num_states <= _SMALL_STATES and lanes * model.once(LinearProgram).work <= _SMALL_WORK
 
 
 def _most_features_of_a_pair(mdp: MDP) -> int:

@@ -143,3 +143,15 @@ def test_the_global_program_on_the_host_and_in_a_program(kind, anchored, monkeyp
     np.testing.assert_allclose(host.error_lower, program.error_lower, rtol=0, atol=digits)
     assert host.policy.dtype == program.policy.dtype == mdp.dtype
     assert host.status == program.status == jaxhom.Status.SOLVED
+
+
+def test_a_dozen_lanes_on_a_small_grid_compile_nothing(rng):
+    mdp = jaxhom.gridworld(10, num_regions=25, discount=0.95).mdp
+    expectations = rng.uniform(0.0, 1.0, (13, 25))
+    with compilations() as names:
+        solution = jaxhom.lpal(mdp, expectations)
+    assert not names
+    assert np.all(solution.status == jaxhom.Status.SOLVED)
+    for lane in (0, 12):
+        exact = jaxhom.lpal(mdp, expectations[lane], method="columns")
+        assert solution.margin[lane] <= exact.margin_bound and exact.margin <= solution.margin_bound[lane]

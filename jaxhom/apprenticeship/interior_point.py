@@ -47,6 +47,8 @@ _MOST_WORK = 3e9  # multiplications of a step: grid100 (bench.instances) takes 4
 _MOST_COMPILED_WORK = 4.0  # of the host's: where features are eliminated before the flow, its factor may be smaller
 _MANY_LANES = 8  # fewer do not pay for compiling, three seconds; of 32 lanes of grid48 each takes half as long
 _SMALL_WORK = 1e8  # multiplications of a step up to which threads of BLAS wait for one another
+_SOON = 1e8  # multiplications of a step of all lanes, up to which the host is done within the seconds of compiling:
+# of grid16, grid24 and grid32 (bench.instances) lanes take 22, 56 and 110 ms each
 _MARGIN_SHARE = 0.02  # of the tolerance, for z . s and the residuals: certificates are made of what is left
 
 
@@ -167,12 +169,18 @@ def is_banded(model: PreparedModel) -> bool:
     return not model.mdp.is_dense and model.once(LinearProgram).work <= _MOST_WORK
 
 
+def is_soon_solved(program: LinearProgram, lanes: int) -> bool:
+    """Whether so many lanes are solved on the host before any program would be compiled."""
+    return lanes * program.work <= _SOON
+
+
 def solve_by_interior_point(request: Request) -> Found:
     """An interior method starts in the middle of what is feasible: what there is to begin with is not used."""
     program, total = request.model.once(LinearProgram), len(request.lanes)
     limit = np.full(total, request.limit or DEFAULT_STEPS)
     with tqdm(desc="LPAL", unit="lane", total=total, disable=not request.progress) as bar:
-        points = _compiled(program, request, limit, bar.update) if total >= _MANY_LANES else None
+        is_compiled = total >= _MANY_LANES and not is_soon_solved(program, total)
+        points = _compiled(program, request, limit, bar.update) if is_compiled else None
         if points is None:
             points = []
             for lane in zip(request.expectations, request.tolerance, limit, strict=True):

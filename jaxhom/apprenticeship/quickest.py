@@ -3,9 +3,9 @@
 Where all expectations can be exceeded at once, the best policy mixes about as many deterministic ones as there are
 features, and each column adds one. If the model's graph is a narrow band, the interior point then takes a tenth as many
 steps, each a few times as long as a column; and in batches PDHG closes half of the lanes for less than either. On a
-small model the interior point beats what a policy to begin with saves, unless the expectations are a policy's. For
-features that overlap, for few features, with a good guess, and on all other models, columns are the quickest; lanes in
-which they do not get on go to the interior point.
+small model the interior point beats what a policy to begin with saves, unless the expectations are a policy's, and some
+dozen lanes of it are done before a program is compiled. For features that overlap, for few features, with a good guess,
+and on all other models, columns are the quickest; lanes in which they do not get on go to the interior point.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhom.apprenticeship.columns import solve_by_columns
-from jaxhom.apprenticeship.interior_point import LinearProgram, is_banded, solve_by_interior_point
+from jaxhom.apprenticeship.interior_point import LinearProgram, is_banded, is_soon_solved, solve_by_interior_point
 from jaxhom.apprenticeship.pdhg import solve_by_pdhg
 from jaxhom.apprenticeship.request import Request
 from jaxhom.apprenticeship.solution import Found
@@ -26,10 +26,10 @@ from jaxhom.models.mdp import MDP
 # Instances are those of bench.instances, with 32 lanes where nothing else is said.
 _MANY_FEATURES = 16  # fewer mix few policies: one lane of racetrack_a, with 2, takes columns a fiftieth of the time
 _MANY_LANES = 8  # from which PDHG begins: grid24 takes 30 ms a lane so, 54 without it; fewer do not pay for compiling
+_BATCH = 32  # lanes from which a batch of any model waits for its programs, which are quicker once they are compiled
 _SAME = 1e-9  # relative difference of sums that are the same
-_SMALL_WORK, _SMALL_STATES = 3.5e7, 1024  # multiplications of a step of all lanes, and states, up to which the interior
-# point begins: alone lanes of grid24, grid32 and bumps24 take 56, 110 and 133 ms so, and 116, 158 and 169 if columns
-# begin; four lanes of grid24 72 and 80 ms each, but seven 54 and 41, since columns are shared
+_SMALL_STATES = 1024  # up to which the interior point may begin: alone lanes of grid24, grid32 and bumps24 take 56, 110
+# and 133 ms so, and 116, 158 and 169 if columns begin
 
 
 def solve_by_the_quickest(request: Request) -> Found:
@@ -38,7 +38,7 @@ def solve_by_the_quickest(request: Request) -> Found:
     if mdp.dtype != jnp.float64 or mdp.num_features < _MANY_FEATURES or not is_banded(model):
         return solve_by_columns(request)
     is_few = len(request.lanes) < _MANY_LANES
-    if is_few and request.weights is None and _is_small(request) and not _are_a_policys(request):
+    if request.weights is None and _is_small(request) and not _are_a_policys(request):
         return in_turn(request, solve_by_interior_point, solve_by_columns)
     is_guided = request.policy is not None or request.weights is not None
     if is_guided or model.once(_most_features_of_a_pair) > 1 or _are_a_policys(request):
@@ -69,9 +69,10 @@ def _sum_of_features(mdp: MDP) -> float:
 
 
 def _is_small(request: Request) -> bool:
-    """Whether steps of the interior point take a few milliseconds each, and the lanes are too few to share columns."""
+    """Whether the interior point is done, lane by lane on the host, before any program would be compiled."""
     model, lanes = request.model, len(request.lanes)
-    return model.mdp.num_states <= _SMALL_STATES and lanes * model.once(LinearProgram).work <= _SMALL_WORK
+    is_small = lanes < _BATCH and model.mdp.num_states <= _SMALL_STATES
+    return is_small and is_soon_solved(model.once(LinearProgram), lanes)
 
 
 def _most_features_of_a_pair(mdp: MDP) -> int:

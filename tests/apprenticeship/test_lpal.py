@@ -466,10 +466,11 @@ def test_prepared_models_and_solutions_are_short_when_printed():
 @pytest.mark.parametrize(
     ("size", "name", "lanes", "guided", "first"),
     [
-        (8, "perturbed", 8, False, "pdhg"),
-        (8, "perturbed", 7, False, "interior_point"),
+        (8, "perturbed", 32, False, "pdhg"),
+        (8, "perturbed", 31, False, "interior_point"),
         (16, "perturbed", 1, False, "interior_point"),
-        (8, "perturbed", 8, True, "columns"),
+        (8, "perturbed", 8, True, "interior_point"),
+        (8, "perturbed", 32, True, "columns"),
         (8, "exact", 8, False, "columns"),
     ],
 )

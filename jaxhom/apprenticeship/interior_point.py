@@ -6,7 +6,7 @@ with c_i the largest |phi_i|. The multipliers of the K feature rows, each divide
 bound. Pairs that are not allowed have no variable. Made for models whose graph is a narrow band
 (grids: a few milliseconds a step at 48 x 48): where columns would need about as many policies as there are features,
 this takes 5-40 steps. There, in float64, compiled programs solve batches, one lane per core at a time (`band_queue`);
-few lanes, and all other models, go lane by lane on the host (`sparse_interior_point`).
+few lanes, some more of small models, and all other models go lane by lane on the host (`sparse_interior_point`).
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ DEFAULT_STEPS = 100
 _MOST_WORK = 3e9  # multiplications of a step: grid100 (bench.instances) takes 4.1 s either way
 _MOST_COMPILED_WORK = 4.0  # of the host's: where features are eliminated before the flow, its factor may be smaller
 _MANY_LANES = 8  # fewer do not pay for compiling, three seconds; of 32 lanes of grid48 each takes half as long
+_BATCH = 32  # lanes from which programs are compiled for small models, too: of grid16 each then takes half as long
 _SMALL_WORK = 1e8  # multiplications of a step up to which threads of BLAS wait for one another
 _SOON = 1e8  # multiplications of a step of all lanes, up to which the host is done within the seconds of compiling:
 # of grid16, grid24 and grid32 (bench.instances) lanes take 22, 56 and 110 ms each
@@ -171,7 +172,7 @@ def is_banded(model: PreparedModel) -> bool:
 
 def is_soon_solved(program: LinearProgram, lanes: int) -> bool:
     """Whether so many lanes are solved on the host before any program would be compiled."""
-    return lanes * program.work <= _SOON
+    return lanes < _BATCH and lanes * program.work <= _SOON
 
 
 def solve_by_interior_point(request: Request) -> Found:

@@ -26,7 +26,6 @@ from jaxhom.models.mdp import MDP
 # Instances are those of bench.instances, with 32 lanes where nothing else is said.
 _MANY_FEATURES = 16  # fewer mix few policies: one lane of racetrack_a, with 2, takes columns a fiftieth of the time
 _MANY_LANES = 8  # from which PDHG begins: grid24 takes 30 ms a lane so, 54 without it; fewer do not pay for compiling
-_BATCH = 32  # lanes from which a batch of any model waits for its programs, which are quicker once they are compiled
 _SAME = 1e-9  # relative difference of sums that are the same
 _SMALL_STATES = 1024  # up to which the interior point may begin: alone lanes of grid24, grid32 and bumps24 take 56, 110
 # and 133 ms so, and 116, 158 and 169 if columns begin
@@ -71,8 +70,7 @@ def _sum_of_features(mdp: MDP) -> float:
 def _is_small(request: Request) -> bool:
     """Whether the interior point is done, lane by lane on the host, before any program would be compiled."""
     model, lanes = request.model, len(request.lanes)
-    is_small = lanes < _BATCH and model.mdp.num_states <= _SMALL_STATES
-    return is_small and is_soon_solved(model.once(LinearProgram), lanes)
+    return model.mdp.num_states <= _SMALL_STATES and is_soon_solved(model.once(LinearProgram), lanes)
 
 
 def _most_features_of_a_pair(mdp: MDP) -> int:

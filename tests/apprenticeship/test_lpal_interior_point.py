@@ -1,5 +1,7 @@
 """LPAL by the sparse interior-point method: HiGHS on the same program, features up to one per state."""
 
+from unittest import mock
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -69,11 +71,10 @@ def test_a_batch_that_cannot_be_compiled_or_begun_goes_lane_by_lane(monkeypatch)
     mdp = jaxhom.gridworld(8, num_regions=16).mdp
     expectations = np.random.default_rng(0).uniform(0.0, 8.0, size=(8, 16))
     expected = jaxhom.lpal(mdp, expectations, method="interior_point")
-
-    def spoiled(*_, **__):
-        raise np.linalg.LinAlgError
-
+    spoiled = mock.Mock(side_effect=np.linalg.LinAlgError)
     monkeypatch.setattr(interior_point.LinearProgram, "solve_many", spoiled)
+    monkeypatch.setattr(interior_point, "_SOON", 0)  # so small a model is not compiled otherwise
     solution = jaxhom.lpal(mdp, expectations, method="interior_point")
+    assert spoiled.called
     assert (solution.status == jaxhom.Status.SOLVED).all()
     np.testing.assert_allclose(solution.margin, expected.margin, rtol=0, atol=1e-3)

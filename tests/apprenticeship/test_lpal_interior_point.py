@@ -68,7 +68,7 @@ def test_compiled_steps_find_what_the_host_finds(restricts):
 
 def test_a_batch_that_cannot_be_compiled_or_begun_goes_lane_by_lane(monkeypatch):
     """A factorisation that rounding spoils at the start is no error of the caller's."""
-    mdp = jaxhom.gridworld(8, num_regions=16).mdp
+    mdp = jaxhom.gridworld(16, num_regions=16).mdp
     expectations = np.random.default_rng(0).uniform(0.0, 8.0, size=(8, 16))
     expected = jaxhom.lpal(mdp, expectations, method="interior_point")
     spoiled = mock.Mock(side_effect=np.linalg.LinAlgError)

@@ -19,7 +19,7 @@ import scipy
 from jaxhom.solvers.block_tridiagonal import BlockCholesky, Blocks, order_in_blocks
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
 
 REGULARISATION = 1e-14  # share of each diagonal entry of what is factorised
 REFINEMENTS = 2  # per solve, at most: as d spreads, the factorisation alone loses digits
@@ -96,19 +96,20 @@ class _Before:
         """What is the same for every d."""
         core, others, blocks = self._core, self._others, self._blocks
         self._core_product, self._square = _Assembly(core, core, blocks), others.multiply(others).tocsr()
-        cross = _Product.of(core, others)
-        self._cross_product, shape = cross, (core.shape[0], others.shape[0])
-        self._cross = scipy.sparse.csr_array((np.zeros(len(cross.row)), (cross.row, cross.column)), shape=shape)
+        shape = _Whole(core.shape[0], others.shape[0])
+        places, self._cross_sums = _known_products(core, others, shape)
+        row, self._column = divmod(places, shape.num_columns)
+        self._cross = scipy.sparse.csr_array((np.zeros(len(places)), (row, self._column)), shape=shape)
         self._cross_transpose = self._cross.T  # of the same numbers
-        self._first, self._second = _in_one_column(cross.column, cross.column)
-        place = blocks.places(cross.row[self._first], cross.row[self._second])
+        self._first, self._second = _in_one_column(self._column, self._column)
+        place = blocks.places(row[self._first], row[self._second])
         is_kept = place >= 0
         self._first, self._second = self._first[is_kept], self._second[is_kept]
         self._places, self._entry = np.unique(place[is_kept], return_inverse=True)
 
     def factor(self, d: np.ndarray) -> None:
-        self._cross.data[:], self._diagonal = self._cross_product(d), self._square @ d
-        schur, half = self._core_product(d), self._cross.data / np.sqrt(self._diagonal)[self._cross_product.column]
+        self._cross.data[:], self._diagonal = self._cross_sums @ d, self._square @ d
+        schur, half = self._core_product(d), self._cross.data / np.sqrt(self._diagonal)[self._column]
         behind = np.bincount(self._entry, half[self._first] * half[self._second], len(self._places))
         schur.ravel()[self._places] -= behind
         self._factor = BlockCholesky(schur, self._blocks, REGULARISATION)
@@ -182,44 +183,32 @@ class _Assembly:
         second: scipy.sparse.sparray | np.ndarray,
         layout: Blocks | _Whole,
     ):
-        self._first, self._transpose, self._layout, self._product = first, second.T, layout, None
+        self._first, self._transpose, self._layout, self._sums = first, second.T, layout, None
         if not (scipy.sparse.issparse(first) and scipy.sparse.issparse(second)):
             return
         self._transpose = second.T.tocsr()
         in_columns = np.diff(first.tocsc().indptr).astype(float) @ np.diff(self._transpose.indptr)
         if in_columns <= _MANY_PRODUCTS:
-            product = _Product.of(first, second)
-            places = layout.places(product.row, product.column)
-            self._product, self._places = product.only(places >= 0), places[places >= 0]
+            self._places, self._sums = _known_products(first, second, layout)
 
     def __call__(self, d: np.ndarray) -> np.ndarray:
-        if self._product is None:
+        if self._sums is None:
             return self._layout.cut((self._first * d) @ self._transpose)
-        return self._layout.filled(self._places, self._product(d))
+        return self._layout.filled(self._places, self._sums @ d)
 
 
-class _Product(NamedTuple):
-    """The entries of F D G^T that are not 0 for every D = diag(d): `sums` @ d, row by row."""
-
-    row: Int[np.ndarray, " e"]
-    column: Int[np.ndarray, " e"]
-    sums: scipy.sparse.csr_array
-
-    @classmethod
-    def of(cls, first: scipy.sparse.sparray, second: scipy.sparse.sparray) -> _Product:
-        f, g = first.tocoo(), second.tocoo()
-        of_first, of_second = _in_one_column(f.col, g.col)
-        place = f.row[of_first].astype(np.int64) * g.shape[0] + g.row[of_second]
-        places, entry = np.unique(place, return_inverse=True)
-        products = f.data[of_first] * g.data[of_second]
-        sums = scipy.sparse.csr_array((products, (entry, f.col[of_first])), shape=(len(places), f.shape[1]))
-        return cls(places // g.shape[0], places % g.shape[0], sums)
-
-    def only(self, is_kept: Bool[np.ndarray, " e"]) -> _Product:
-        return _Product(self.row[is_kept], self.column[is_kept], self.sums[is_kept])
-
-    def __call__(self, d: np.ndarray) -> np.ndarray:
-        return self.sums @ d
+def _known_products(
+    first: scipy.sparse.sparray, second: scipy.sparse.sparray, layout: Blocks | _Whole
+) -> tuple[Int[np.ndarray, " e"], scipy.sparse.csr_array]:
+    """The places in a layout where F D G^T is not 0 for every D = diag(d), ascending, and P: it is P d there."""
+    f, g = first.tocoo(), second.tocoo()
+    of_first, of_second = _in_one_column(f.col, g.col)
+    place = layout.places(f.row[of_first].astype(np.int64), g.row[of_second])
+    is_kept = place >= 0
+    of_first, of_second = of_first[is_kept], of_second[is_kept]
+    places, entry = np.unique(place[is_kept], return_inverse=True)
+    products = f.data[of_first] * g.data[of_second]
+    return places, scipy.sparse.csr_array((products, (entry, f.col[of_first])), shape=(len(places), f.shape[1]))
 
 
 def _in_one_column(
